@@ -1,12 +1,13 @@
 """One steady cycle of large shear: complex modulus of the first harmonic, and relative amplitude of the third harmonic.
 
 The sample is incompressible and isotropic, with a strain energy function W. W gives the instantaneous second
-Piola-Kirchhoff stress S. The relaxation of S does not depend on the strain (book chapter, section 4.2). In simple shear
-with the amount g(t) = a sin(wt), amplitude a and angular frequency w, the shear stress is S12 + g S22. The pressure
-does not change this stress. S is a sum of harmonics of w. Relaxation multiplies harmonic n by the modulus ratio m(nw) =
-G*(nw)/G0, with the complex modulus G* and the instantaneous modulus G0. In torsion between plates, every ring of the
-sample is in simple shear, with an amount of shear that depends on the radius (a universal deformation: Rivlin 1949). So
-the torque is a sum over rings. A rheometer converts this torque into moduli as if the sample were linear.
+Piola-Kirchhoff stress S. The relaxation of S does not depend on the strain (book chapter, section 4.2). The sample is
+in simple shear. The amount of shear is g(t) = a sin(wt), with the amplitude a and the angular frequency w. The shear
+stress is S12 + g S22, which does not depend on the pressure. S is a sum of harmonics of w. Relaxation multiplies
+harmonic n by the modulus ratio m(nw) = G*(nw)/G0, with the complex modulus G* and the instantaneous modulus G0. In
+torsion between plates, every ring of the sample is in simple shear, and the amount of shear depends on the radius (a
+universal deformation: Rivlin 1949). So the torque is a sum over rings. A rheometer converts this torque into moduli as
+if the sample were linear.
 """
 
 from typing import NamedTuple
@@ -34,13 +35,13 @@ class Reading(NamedTuple):
 
     shears: np.ndarray  # (K,) amounts of shear, above 0
     F: jax.Array  # (K, 3, 3) deformation gradients
-    #: (M, 2, A, 2, K) complex, for M sets of modulus ratios, 2 harmonics (1 and 3), A strain amplitudes, 2 components
-    #: (S12/g and S22) and K amounts of shear.
+    #: Complex matrices (M, 2, A, 2, K) for M sets of modulus ratios, 2 harmonics (1 and 3), A strain amplitudes, 2
+    #: components (S12/g and S22) and K amounts of shear.
     harmonics: jax.Array
 
 
 def reading(strains: np.ndarray, memories: np.ndarray, plates: str = "parallel") -> Reading:
-    """Compute the matrices for cycles with given strain amplitudes at the rim.
+    """Compute the matrices of `Reading` for cycles with given strain amplitudes at the rim.
 
     Args:
         strains: A strain amplitudes (A,) at the rim.
@@ -72,13 +73,13 @@ def reading(strains: np.ndarray, memories: np.ndarray, plates: str = "parallel")
 
 
 def _radii_and_weights(plates: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the radii of rings divided by the radius of the rim, and the weights of the moduli of these rings in the
-    modulus that a rheometer reports."""
+    """Return the radius of each ring, divided by the radius of the rim, and the weight of each ring. A rheometer
+    reports the weighted sum of the moduli of the rings."""
     if plates == "cone":
         return np.ones(1), np.ones(1)
     x, w = np.polynomial.legendre.leggauss(RINGS)
     rho = 0.5 * (1 + x)
-    return rho, 0.5 * w * 4 * rho**3  # weight of a ring in 2 torque / (pi radius^3) / (strain at the rim)
+    return rho, 0.5 * w * 4 * rho**3  # modulus = 2 torque / (pi radius^3) / (strain at the rim)
 
 
 def _lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -110,8 +111,9 @@ def first_and_third(law: Law, r: Reading, shares: jax.Array) -> tuple[jax.Array,
 
 
 def _instantaneous_stress(law: Law, F: jax.Array) -> jax.Array:
-    """Return the second Piola-Kirchhoff stress (K, 3, 3) [Pa] of the isochoric energy for K simple shears F (K, 3, 3).
-    The result has no derivatives with respect to F, so F must be constant."""
+    """Return the second Piola-Kirchhoff stress (K, 3, 3) [Pa] for K simple shears F (K, 3, 3). It comes from the
+    isochoric energy, or from the whole law if the law has no separate isochoric energy. F must be constant, because
+    the result may have no derivatives with respect to F."""
     split = law.isochoric_part()
     if split is not None and split.stretch_energy is not None:
         return pack(stress_at_constant(split, unpack(F)))

@@ -21,8 +21,8 @@ from fitting.readers.frequency_sweep import smooth_curve
 from liverjax.core.errors import InputError
 from liverjax.laws import Law
 
-#: If the loss tangent, divided by that of the law, changes by more than this fraction over the sweep, the program warns
-#: that the relaxation depends on the strain.
+#: The program compares the measured loss tangent with the loss tangent of the law. If their ratio changes by more than
+#: this fraction over the sweep, the program warns that the relaxation depends on the strain.
 CHANGED = 0.2
 
 
@@ -152,8 +152,8 @@ def with_loss_tangent(candidate: Candidate) -> Candidate:
 
 
 def _as_curves(sweep: StrainSweep) -> list[Curve]:
-    """Return storage and loss modulus as two curves over the amount of shear at the rim. These curves are needed for
-    the warnings about a fit."""
+    """Return the storage modulus and the loss modulus as two curves over the amount of shear at the rim. `assessed`
+    needs these curves."""
     F = np.tile(np.eye(3), (len(sweep.strain), 1, 1))
     F[:, 0, 1] = sweep.strain
     return [Curve(name, "simple_shear", F, (0, 1), G) for name, G in (("G'", sweep.storage), ("G''", sweep.loss))]

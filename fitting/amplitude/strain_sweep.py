@@ -30,17 +30,17 @@ class StrainSweep(NamedTuple):
 
 
 def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | None = None) -> StrainSweep:
-    """Read a strain sweep from a text file, a CSV file or a workbook. The columns are frequency, storage modulus, loss
-    modulus and strain amplitude.
+    """Read a strain sweep (frequency, storage modulus, loss modulus, strain amplitude) from a text file or workbook.
 
     Args:
-        path: path of the file. The name of its strain column is strain, with the unit % or 1.
+        path: path of the file. Its strain column is named strain_% or strain_1, or as the software of a rheometer names
+            it. A missing unit is taken as 1.
         table: name of the table, a part of its name, or its number (from 1), if the file has several tables.
         max_strain: maximum strain [1]; points with a larger strain are ignored. None: all points are used.
 
     Raises:
-        InputError: no table has a column of strains; the moduli are tensile moduli; there are several frequencies or
-            temperatures; there are too few points.
+        InputError: a column is missing; the moduli are tensile; a strain is too large; several frequencies or
+            temperatures; too few points.
     """
     found = [t for t in tables_of(str(path), text_of(path, "a strain sweep").splitlines()) if "strain" in t.raw]
     if not found:

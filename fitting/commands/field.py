@@ -130,7 +130,7 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     problem, beside = scene_numbers.with_discretisation_as_noise(problem)
     _tell_sizes(problem, beside)
     with bar, warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="the effect of the (mesh error|time step)")  # a second time
+        warnings.filterwarnings("ignore", message="the effect of the (mesh error|time step)")  # already given
         found = field.estimate(problem, name, length, how)
     good = all(c == status.CONVERGED for c in found.codes) and found.distance <= field.FAR
     print(field_report.table_of_field(mesh, found))

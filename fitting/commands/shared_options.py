@@ -81,9 +81,9 @@ def write_cards(out: Path, model: "Maxwell") -> None:
 
 
 def usable_sweep(options: argparse.Namespace, path: Path) -> "Sweep":
-    """Read a sweep, and ignore the points at which the instrument dominates. If --max-frequency is given, fewer points
-    are ignored: those outside the band, and those at which the raw torque or the raw phase shows too much inertia of
-    the instrument (`without_inertia`)."""
+    """Read a sweep, and ignore the points at which the instrument dominates. If --max-frequency is given, only these
+    points are ignored: points outside the band, and points at which the raw torque or the raw phase shows too much
+    inertia of the instrument (`without_inertia`)."""
     from fitting.readers import rheometer
 
     try:
@@ -100,8 +100,8 @@ def usable_sweep(options: argparse.Namespace, path: Path) -> "Sweep":
 
 def without_instrument_or_sample(options: argparse.Namespace, sweep: "Sweep") -> "Sweep":
     """Return the sweep without the points at which the instrument dominates. The moduli still contain the inertia of
-    the sample. If the density of the sample is given, its inertia is subtracted for the search of these points, so that
-    it is not mistaken for the inertia of the instrument."""
+    the sample. If density and height of the sample are given, these points are searched in moduli without the inertia
+    of the sample. So this inertia is not mistaken for the inertia of the instrument."""
     import numpy as np
 
     from fitting.fits import sample_inertia

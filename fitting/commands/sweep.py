@@ -150,7 +150,7 @@ def run(options: argparse.Namespace) -> int:
 
     _check(options)
     if options.master is not None:
-        options.method = options.method or "closed-form"  # a simulation cannot be compared at shifted frequencies
+        options.method = options.method or "closed-form"  # shifted frequencies are not simulated by default
     elif len(options.sweep) > 1:
         from fitting.commands import samples
 
@@ -405,7 +405,8 @@ def _closed(options: argparse.Namespace, sweep: "Sweep", dense: "Spectrum") -> "
 
 
 def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sweep"]:
-    """Return the closed-form fit, by default also the fit of the simulation, and the corrected sweep of both fits."""
+    """Return a list of fits and the corrected sweep. The list contains the closed-form fit and, by default, the fit of
+    the simulation."""
     from fitting.fits import instrument, sample_inertia, viscoelastic
     from fitting.fits.honesty import edges, total_error
     from fitting.methods import generalised_maxwell

@@ -67,9 +67,9 @@ def read_any(options: argparse.Namespace, path: Path, whole: bool = False) -> "M
     """Read a test from a file: a TOML description of a test rig, shear waves, a further sweep, or a relaxation or creep
     test.
 
-    Points of a further sweep are ignored outside the band that the user gives. As in the first sweep, points at which
-    the instrument dominates are ignored too. If `whole` is true (for a test that is only predicted), the limits of the
-    band are not applied.
+    Points of a further sweep, or of shear waves, are ignored if they lie outside the band that the user gives. In a
+    sweep, points at which the instrument dominates are ignored too. If `whole` is true (for a test that is only
+    predicted), the limits of the band are not applied.
     """
     from fitting.readers import rheometer, time_tests
     from fitting.waves import dispersion

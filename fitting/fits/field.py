@@ -2,14 +2,14 @@
 
 The parameter of an element is the value in the scene times exp(m). Here m is the mean of a nodal field (V,) over the
 element. `fitting.methods.prior` describes the prior of this field. The unknown is the whitened field z, whose entries
-are independent with variance 1 in the prior. A Gauss-Newton method in a trust region (Steihaug 1983) minimises chi^2/2
-+ |z|^2/2. J is the derivative of the residuals with respect to z. The Hessian I + J^T J is never assembled: each
-product of the Hessian with a vector needs one linearised run and one transposed run. No eigenvalue of this Hessian is
-below 1. The norm of the gradient is therefore an upper bound of the distance to the minimum, in standard deviations of
-the map. The prior's standard deviation of m sets the weight of the regularisation. This standard deviation is increased
-until chi^2 is as low as the number of measured components (discrepancy principle; Morozov 1966), or until chi^2 no
-longer falls. The uncertainty comes from the same Hessian. Lanczos iterations find the largest eigenvalues of J^T J
-(Bui-Thanh et al. 2013).
+are independent with variance 1 in the prior. A Gauss-Newton method in a trust region (Steihaug 1983) minimises
+(chi^2 + |z|^2)/2, where chi^2 is the sum of the squared residuals. J is the derivative of the residuals with respect to
+z. The Hessian I + J^T J is never assembled: each product of the Hessian with a vector needs one linearised run and one
+transposed run. No eigenvalue of this Hessian is below 1. The norm of the gradient is therefore an upper bound of the
+distance to the minimum, in standard deviations of the map. The prior's standard deviation of m sets the weight of the
+regularisation. This standard deviation is increased until chi^2 is as low as the number of measured components
+(discrepancy principle; Morozov 1966), or until chi^2 no longer falls. The uncertainty comes from the same Hessian.
+Lanczos iterations find the largest eigenvalues of J^T J (Bui-Thanh et al. 2013).
 """
 
 import re
@@ -64,7 +64,7 @@ class Field(NamedTuple):
     reached: bool  # whether chi^2 is at most the number of components
     distance: float  # distance to the minimum: length of the next Gauss-Newton step, in standard deviations
     history: list[dict]  # one entry for each prior deviation: chi2, iterations, evaluations, seconds
-    eigenvalues: np.ndarray  # largest ones of J^T J; the data determine directions of z with values above 1
+    eigenvalues: np.ndarray  # largest eigenvalues of J^T J; the data determine the directions of z with values > 1
     codes: tuple[int, ...]
     seconds: float
     given: np.ndarray  # (E,) True where a [[region]] of the scene, not the map, sets the modulus
@@ -74,7 +74,8 @@ def start_of(problem: Problem, name: str) -> jax.Array:
     """Return the value of the parameter in each element (E,) before the fit.
 
     Raises:
-        InputError: the scenes have different meshes, or `name` is not a positive number.
+        InputError: the scenes have different meshes, the parameter is a list or not positive, or a [[region]] sets the
+            parameter in every element.
     """
     scene = problem.scenes[0]
     E = scene.mesh.number_of_elements
@@ -258,7 +259,7 @@ class MapOptions(NamedTuple):
     """Options of the search for a map, and of the file that keeps its progress."""
 
     max_iterations: int = 60  # maximum number of iterations for each standard deviation of the prior
-    modes: int = 60  # maximum number of directions with a computed uncertainty
+    modes: int = 60  # maximum number of eigenvectors of J^T J in the uncertainty
     file: Path | None = None  # HDF5 file with the progress, written after every iteration; None: no file
     resume: bool = False  # continue the search in that file, if the file exists
     #: Called after each iteration with the index of the standard deviation in `DEVIATIONS` and with chi^2 per
@@ -397,8 +398,8 @@ _NO_BIASES: dict[str, np.ndarray | None] = {"mesh_bias": None, "time_step_bias":
 def _biases_of_map(
     search: _Search, here: _LinearRuns, values: np.ndarray, vectors: np.ndarray
 ) -> dict[str, np.ndarray | None]:
-    """Return the changes of the field m (V,) due to the errors of the meshes and of the time steps: (I + J^T J)^-1 J^T
-    times these errors in the residuals. Unknown changes are None."""
+    """Return the errors of the field m (V,) due to the meshes and due to the time steps. The error of z is
+    (I + J^T J)^-1 J^T times the errors of the residuals, and m is computed from z. Unknown errors are None."""
     biases = dict(_NO_BIASES)
     errors = discretisation_errors(search.problem, values_at(search.problem, search.name, search.base, here.m))
     for kind, error in errors._asdict().items():
@@ -436,8 +437,8 @@ def level_sentence(found: Field) -> str | None:
 
 
 def map_bias_sentences(found: Field) -> list[str]:
-    """Return a warning for the mesh, and one for the time step. Each is returned only if the error of the mesh (or of
-    the time step) changes the map at some node by more than the standard deviation there."""
+    """Return at most two warnings: one about the mesh error, and one about the time step error. A warning is given only
+    if its error changes the map at some node by more than the standard deviation at this node."""
     sources = (
         (found.mesh_bias, "mesh", "mesh_bias", "refine the mesh"),
         (found.time_step_bias, "time step", "time_step_bias", "use smaller time steps"),

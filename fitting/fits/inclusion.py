@@ -6,8 +6,8 @@ the modulus of an inclusion. The map only gives the starting point of the fit. T
 length proportional to the element size, so the residuals have derivatives with respect to the position of the sphere.
 An error of the radius can compensate an error of the modulus. The elements should therefore be quadratic, or much
 smaller than the sphere. An element that the edge cuts has the mean of both moduli, weighted by volume. The estimated
-error of the mesh contains the error of this mean: the richer elements of the estimate have the modulus of the sphere
-at each integration point.
+error of the mesh contains the error of this mean, because the estimate uses richer elements, which resolve the edge
+better.
 """
 
 from functools import partial
@@ -32,7 +32,7 @@ NAMES = ("centre.x", "centre.y", "centre.z", "radius", "background", "inclusion"
 
 
 def edge_length(mesh: TetMesh) -> float:
-    """Return the mean length [m] of the edges: that of a regular tetrahedron with the mean volume."""
+    """Return a typical edge length [m] of the elements: the edge of a regular tetrahedron with their mean volume."""
     return float(np.cbrt(6 * np.sqrt(2) * np.mean(np.asarray(mesh.volumes))))
 
 
@@ -44,9 +44,9 @@ def _places_in_element() -> np.ndarray:
 
 
 def inside(mesh: TetMesh, L: np.ndarray, centre: jax.Array, radius: Number) -> jax.Array:
-    """Return whether points lie inside the sphere, (n, E): 1 inside, 0 outside, smooth in between.
+    """Return a smooth indicator (n, E) of the sphere at n points of each of E elements: 1 inside, 0 outside.
 
-    `L` (4, n) are the barycentric coordinates of the n points of each element.
+    `L` (4, n): barycentric coordinates of the n points of each element.
     """
     width = _EDGE * edge_length(mesh) / _POINTS
     points = jnp.einsum("kq,eki->qei", L, mesh.points[mesh.tetrahedra])
@@ -104,7 +104,7 @@ def estimate(problem: Problem, name: str, start: np.ndarray, **options: Any) -> 
         return modulus(u, base, partial(fraction, mesh))
 
     def at_points(u, richer):
-        own = jnp.repeat(base, richer.number_of_elements // mesh.number_of_elements)  # parts of elements if refined
+        own = jnp.repeat(base, richer.number_of_elements // mesh.number_of_elements)  # refinement divides elements
         if richer.order == 1:
             return modulus(u, own, partial(fraction, richer))
         return modulus(u, own[None], partial(inside, richer, basis(richer.order).L))
@@ -114,7 +114,8 @@ def estimate(problem: Problem, name: str, start: np.ndarray, **options: Any) -> 
         at_rest = jnp.mean(base)
         return jnp.stack([*u[:3], jnp.exp(u[3]), at_rest * jnp.exp(u[4]), at_rest * jnp.exp(u[4] + u[5])])
 
-    # The numbers of regions replace those of the sphere, element by element. A loaded mesh has other points in the run.
+    # A [[region]] sets the modulus of whole elements. If the mesh describes the loaded body, its points differ in the
+    # run. In both cases, the error at the edge of the sphere cannot be computed with `at_points`.
     other = any(scene.region or scene.points_are == "loaded" for scene in problem.scenes)
     resolved = None if other else at_points
     unknowns = Unknowns(np.asarray(start) / np.asarray(scale), values_of, natural_of, NAMES, resolved)
@@ -126,9 +127,9 @@ SMALL = 1.5
 
 
 def size_sentence(mesh: TetMesh, found: Estimate) -> str | None:
-    """Return a warning if the sphere is as small as the elements, otherwise None. Each element has one modulus, so the
-    elements that the sphere cuts have a modulus in between. `mesh_bias` contains this error, but only its first order,
-    which is not enough for so few elements."""
+    """Return a warning if the sphere is as small as the elements, otherwise None. Each element has one modulus, so an
+    element at the edge of the sphere has a mean of both moduli. `mesh_bias` contains this error only to first order,
+    which is not accurate enough for so few elements."""
     radius, edge = float(found.values[3]), edge_length(mesh)
     if radius >= SMALL * edge:
         return None

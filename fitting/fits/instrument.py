@@ -5,8 +5,8 @@ The instrument subtracts the torque of its inertia I; the modulus is the torque 
 the geometry. If the true inertia is I (1 + delta), G' is too small by delta I omega^2 / K at the angular frequency
 omega. Without a prior, this term would compensate errors of the model. Here delta has a normal prior around 0 with the
 standard deviation `raw_torque.UNCERTAINTY`. delta is fitted only if the file contains the raw torque or the raw phase.
-The fitted delta is used only if it stays the same, within its error, when the upper end of the band is left out. The
-friction b of the bearing adds b omega / K to G''. The error of b has a normal prior around 0 with the standard
+The fitted delta is used only if it changes by at most two standard errors when the upper end of the band is left out.
+The friction b of the bearing adds b omega / K to G''. The error of b has a normal prior around 0 with the standard
 deviation that the user gives.
 """
 
@@ -38,8 +38,8 @@ SETTLED = 1e-6
 
 
 class Nuisance(NamedTuple):
-    """An error of the inertia or friction that the instrument subtracts. The size of the error is given in standard
-    deviations of its prior."""
+    """An error of the inertia or of the friction that the instrument subtracts. The size of the error is given in
+    standard deviations of its prior."""
 
     name: str
     moved: np.ndarray  # (n,) change of G* [Pa] at the n frequencies if the error is one standard deviation
@@ -72,7 +72,7 @@ class InstrumentErrors(NamedTuple):
 
     values: np.ndarray  # (k,)
     covariance: np.ndarray  # (k, k)
-    part: np.ndarray | None  # `values` without the last half decade of the sweep; None if too few points are left
+    part: np.ndarray | None  # `values` fitted without the last half decade of the sweep; None: unknown
     part_errors: np.ndarray | None
     found: bool  # False: the rounds of fit and correction did not converge
 

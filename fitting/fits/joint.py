@@ -1,4 +1,4 @@
-"""One set of Prony parameters from several tests at once (sweep, creep, tension, indentation). Each test has its
+"""One set of Prony parameters, fitted to several tests together (sweep, creep, tension, indentation). Each test has its
 individual noise.
 
 The Levenberg-Marquardt method minimises the residuals of all tests together, each divided by its noise. A rig is a test
@@ -62,8 +62,8 @@ def torsion_sweep(data: Sweep, rig: torsion.Rig, torque: Number, drive: torsion.
     """Return the test for a frequency sweep that the torsion simulation predicts, at the torque amplitudes `torque` [N
     m]. `rig.free_height` states whether the height of the sample is free.
 
-    The moduli are corrected for the mesh. The error of the time steps is that at small strain; it is unknown if the rig
-    has a density or is compressed.
+    The moduli are corrected for the mesh. The error of the time steps is computed for small strain. This error is
+    unknown if the rig has a density or is compressed.
     """
     check_sweep(data)
     omega = jnp.asarray(data.angular_frequency)
@@ -131,8 +131,8 @@ def fit(
     """Fit the Maxwell parameters (`uncertainty.parameter_names`) to all tests. Return them with standard errors.
 
     If tests are simulated in rigs, `mesh_bias` and `time_step_bias` are the errors of each parameter due to meshes and
-    time steps. Subtract both to correct the parameter. A warning is given if one of them exceeds the standard error. A
-    test whose errors are unknown (`Test.errors`) counts as exact.
+    time steps. Subtract both to correct the parameter. A warning is given if one of them exceeds the standard error. If
+    the errors of a test are unknown (`Test.errors` is None), they count as 0.
 
     Args:
         tests: one or more tests.
@@ -205,8 +205,8 @@ def _check_joint(tests: Sequence[Test], start: generalised_maxwell.Maxwell, law:
 
 
 def _missing(tests: Sequence[Test], material: tuple[Law, Prony]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the errors (n,) of all n readings due to the meshes, and due to the time steps, divided by the standard
-    deviations of their noise."""
+    """Return two errors of all n readings: those due to the meshes (n,), and those due to the time steps (n,). Both are
+    divided by the standard deviations of the noise of the readings."""
     both = []
     for test in tests:
         none = np.zeros(len(test.measured))

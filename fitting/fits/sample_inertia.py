@@ -65,7 +65,7 @@ def taken_off(sweep: Sweep, density: float, height: float) -> Sweep:
     this function subtracts. A note gives the largest change.
 
     Raises:
-        InputError: at one frequency, no modulus can be computed, or G' or G'' without the inertia is not positive.
+        InputError: at some frequency, no modulus can be computed, or G' or G'' without the inertia is not positive.
     """
     seen = sweep.storage + 1j * sweep.loss
     G = modulus_of(seen, sweep.angular_frequency, density, height)

@@ -63,7 +63,7 @@ def fit(
         progress: called with the name of each fit.
 
     Raises:
-        InputError: there is only one sweep, or the model is unknown.
+        InputError: there are fewer than two sweeps, the model is unknown, or `modes` is invalid.
     """
     if len(sweeps) < 2:
         raise InputError(
@@ -103,8 +103,8 @@ def _candidate_for_all(sweeps: list[Sweep], fits: list[Fit], label: dict) -> _Ca
 def _modes_for_all(
     sweeps: list[Sweep], dense: list[Spectrum], modes: int | str, progress: Callable
 ) -> list[_Candidate]:
-    """Return the fits of all samples with 1, 2, … Prony modes. The search ends when two numbers of modes, one after the
-    other, do not lower the summed criterion."""
+    """Return the fits of all samples with 1, 2, … Prony modes. The search ends after an exact fit. It also ends after
+    two numbers of modes in a row that do not lower the summed criterion or that most samples do not determine."""
     largest = min(generalised_maxwell.largest_number_of_modes(s) for s in sweeps)
     numbers = range(1, min(largest, min(map(uncertainty.supported_modes, sweeps))) + 1)
     if modes != "auto":
@@ -126,8 +126,8 @@ def _modes_for_all(
 
 
 def values_of_sample(fit: Fit) -> dict[str, tuple[float, float]]:
-    """Return the parameters of a fit with their standard errors: those that `edges.values` returns and, for a spectrum,
-    also its strengths."""
+    """Return the parameters of a fit with their standard errors. These are the parameters of `edges.values` and, for a
+    spectrum, also its strengths."""
     out = edges.values(fit)
     if fit.kind.effective is not None and fit.parameters is not None:
         rows = zip(fit.kind.names, fit.parameters.values, fit.parameters.standard_errors, strict=True)

@@ -26,7 +26,7 @@ from liverjax.simulation.automatic import with_solver
 from liverjax.simulation.mesh_error import mesh_error_of
 from liverjax.simulation.run import prepared
 
-#: Function of a richer mesh -> parameters by dotted name (see `mesh_error_of`).
+#: Function from a richer mesh to the parameters of the scene, by dotted name (see `mesh_error_of`).
 Finer = Callable[[TetMesh], Content]
 
 
@@ -58,7 +58,7 @@ def check_data(problem: Problem) -> None:
 
 def misfit(problem: Problem, values: Mapping[str, object], store: str | int = "all") -> tuple[jax.Array, jax.Array]:
     """Return the n residuals (n,) of all scenes for the parameters `values`, and the worst status code of each
-    scene."""
+    scene. `store`: see `liverjax.simulate`."""
     parts, codes = [], []
     for scene, data in zip(problem.scenes, problem.data, strict=True):
         result = lj.simulate(lj.with_parameters(scene, values), store=store)
@@ -85,8 +85,8 @@ class Unknowns(NamedTuple):
     values_of: Callable[[jax.Array], Content]  # u -> parameters of the scenes by dotted name
     natural_of: Callable[[jax.Array], jax.Array]  # u -> m parameters to report (m,)
     names: Sequence[str]  # names of the reported parameters
-    #: Function (u, mesh) -> parameters (Q, E) at the Q integration points of the E elements, if they vary within an
-    #: element more than those of `values_of`; the estimated error of the mesh then contains this difference
+    #: Function (u, richer mesh) -> parameters (E,) or (Q, E) of its E elements with Q integration points. It is needed
+    #: if the parameters vary within an element. The estimated error of the mesh then contains this variation.
     at_points: Callable[[jax.Array, TetMesh], Content] | None = None
 
 
@@ -265,9 +265,9 @@ def _all_differences(data: Displacements, scene: Scene, result: lj.Result) -> ja
 
 
 def with_discretisation_as_noise(problem: Problem) -> tuple[Problem, list[dict[str, float]]]:
-    """Return the problem with larger noise, which contains the errors of the meshes and the time steps. Also return the
-    sizes of the errors that are known in each scene, divided by the stated noise [1], with the keys of
-    `Discretisation`.
+    """Return the problem with larger noise, which contains the errors of the meshes and the time steps. Also return,
+    for each scene, the sizes of these errors, divided by the stated noise [1]. The keys are those of `Discretisation`;
+    unknown errors are not included.
 
     A size is a root mean square over the measured components, for the parameters in the scenes. Without the added
     noise, a map would compensate these errors by a false stiffness. If an error cannot be estimated, a warning is

@@ -1,7 +1,7 @@
 """Identify a generalised Maxwell model through the simulated rheometer: the torsion of a sample between its plates.
 
-The recursion is the update of the history variables of viscosity from time step to time step. The rig is the machine
-with its sample. The linear rig is the same test for small strain, whose moduli are known without a mesh.
+The recursion is the update of the history variables of the viscosity in each time step. The rig is the machine with its
+sample. The linear rig is the same test for small strain, whose moduli are known without a mesh.
 """
 
 import time
@@ -152,8 +152,8 @@ def with_jacobian(
 def small_strain_moduli(
     rig: torsion.Rig, model: Maxwell, law: laws.Law, omega: jax.Array, simulation: Simulation
 ) -> jax.Array:
-    """Return the complex moduli (n,) [Pa] at n frequencies that the simulation approaches for small strain, without the
-    error of the mesh."""
+    """Return the complex moduli (n,) [Pa] of the linear rig at n frequencies. For small strain, the moduli of the
+    simulation approach these moduli, except for the error of the mesh."""
     scaled, prony = law_and_prony(model, law, simulation)
     if simulation.precompression:
         scale = model.shear_modulus / law.shear_modulus()

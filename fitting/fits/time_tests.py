@@ -70,8 +70,8 @@ class TimeFit(NamedTuple):
 
 
 def relative_sizes(measured: np.ndarray, fitted: np.ndarray, scales: np.ndarray) -> np.ndarray:
-    """Return the divisors (m,) of the relative errors of m values. A divisor is the root of the sum of two squares:
-    that of the fitted response, and that of the median of |fit - data|.
+    """Return the divisors (m,) of the relative errors of m values. A divisor is the root of the sum of two squares: the
+    square of the fitted response, and the square of the median of |fit - data|.
 
     If the response changes sign, as in cycles, the divisors are the scales of the residuals. In other tests, these
     scales would hide noise, because the lower bound of the scales is 33 times the noise.
@@ -115,7 +115,7 @@ def thinned(test: TimeTest) -> np.ndarray:
 
 def _begins_of_loads(test: TimeTest) -> np.ndarray:
     """Return the times [s] at which the driven quantity begins to change, from `TimeTest.begun` on. If there are more
-    than `MOST_LOADS` such times (for example in cycles), only the first one is returned.
+    than `MOST_LOADS` such times (for example in cycles), only the first of these times is returned.
     """
     driven = np.abs(test.driven)
     still = max(STILL * float(driven.max()), 8 * noise_of_series(test.driven))

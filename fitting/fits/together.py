@@ -27,7 +27,7 @@ from liverjax.core.struct import Content
 
 #: ROUNDS: maximum number of rounds, each with a fit and then new weights of the tests. SETTLED: the rounds end if the
 #: noise of no test changes by more than this fraction. QUIETEST: minimum relative noise of a test. FIRST: relative
-#: noise in round 1. STARTS: number of starting points. LEAST_FREEDOM: degrees of freedom needed for a noise.
+#: noise in round 1. STARTS: number of starting points. LEAST_FREEDOM: degrees of freedom needed to estimate a noise.
 ROUNDS, QUIETEST, STARTS, FIRST, SETTLED, LEAST_FREEDOM = 12, 1e-5, 6, 0.03, 0.01, 3.0
 #: The tests contradict each other if the noise of a test in the common fit, divided by its noise in a fit to this test
 #: alone, exceeds this ratio.
@@ -385,13 +385,14 @@ def _of_better_fits(chosen: Together, tried: list[Together]) -> list[str]:
 BETTER = 4.0
 
 
-#: The program warns if a rise of the load between two rows lasts longer than this fraction of the shortest relaxation
+#: The program warns if a change of the load between two rows takes at least this fraction of the shortest relaxation
 #: time.
 _SHORT = 0.2
 
 
 def _of_rises(chosen: Together) -> list[str]:
-    """Return a warning for each load that rises between two rows of the file, if modes relax during this time."""
+    """Return a warning for each relaxation or creep test whose load changes between two rows of the file, if modes
+    relax during this time. Only the first such change of a test is considered."""
     own = chosen.model.relaxation_times[np.asarray(chosen.model.ratios) > 0.01]
     out = []
     for test in (t for t in chosen.tests if isinstance(t, TimeTest)):

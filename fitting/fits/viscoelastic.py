@@ -28,7 +28,7 @@ class Kind(NamedTuple):
     """The meaning of the variables u of a fit. By default, u describes Prony modes."""
 
     name: str = "prony"
-    maxwell: Callable[[Array], Maxwell] = generalised_maxwell.natural  # Prony modes of u, for the simulation
+    maxwell: Callable[[Array], Maxwell] = generalised_maxwell.natural  # u -> Prony modes
     names: tuple[str, ...] = ()  # names of the model's parameters; empty: the modes are the parameters
     units: tuple[str, ...] = ()
     values: Callable[[Array], Array] | None = None  # u -> P parameters of the model (P,)
@@ -259,7 +259,7 @@ def _misfit(sweep: Sweep, storage: np.ndarray, loss: np.ndarray, kind: Kind) -> 
 
 
 def identifiable(fit: Fit, sweep: Sweep) -> bool:
-    """Return whether the fit converged and no warning advises against one of its modes."""
+    """Return whether the fit converged and none of its modes is superfluous (`uncertainty.superfluous`)."""
     return bool(fit.converged and not uncertainty.superfluous(sweep, fit.uncertainty))
 
 
@@ -282,7 +282,7 @@ def information_criterion(fit: Fit) -> float:
     return float(m * np.log(mean_square(fit)) + number_of_parameters(fit) * np.log(m))
 
 
-#: A fit whose relative residuals are all below this value is exact, because no data have so many digits.
+#: A fit counts as exact if all its relative errors are below this value, because no data have so many digits.
 EXACT = 1e-7
 
 
@@ -295,9 +295,9 @@ def choose_modes(
     """Raise the number of modes while the criterion falls and every mode is identifiable, or until the fit is exact.
     Return the chosen fit and all tried fits. `progress` is called with the name of each fit.
 
-    A single failure may be a local minimum, so the search ends when two numbers of modes in a row fail. If
-    the computation for a number of modes breaks down, this counts as a failure too. A warning names this number, and
-    the other fits are kept.
+    A single failure may be a local minimum, so the search ends only after two failures in a row. If the computation for
+    a number of modes raises an error, this counts as a failure too. A warning then names this number of modes, and the
+    search continues with the other fits.
     """
     cap = min(uncertainty.supported_modes(sweep), generalised_maxwell.largest_number_of_modes(sweep))
     tried: list[Fit] = []

@@ -18,7 +18,7 @@ from liverjax.core.struct import Content
 #: than SCATTERS times the scatter of the points. It also warns if the standard error of a shift factor is larger than
 #: LOOSE [decades].
 FAR_OFF, SCATTERS, LOOSE = 0.05, 2.0, 0.3
-#: If the relative distance of the points from the curve is below this value, the spline alone may cause this distance.
+#: If the relative distance of the points from the curve is below this value, the error of the spline may be its cause.
 #: Then no factors that multiply the moduli are reported.
 SMOOTH = 1e-3
 #: Factors that multiply the moduli (vertical shifts) are reported only if the probability of the same improvement by
@@ -85,8 +85,8 @@ def _shifted_sweep(sweep: Sweep, log_a: float, log_b: float) -> Sweep:
 
 
 def _scatter_of_points(sweeps: list[Sweep]) -> float:
-    """Return the relative scatter of the points about a smooth curve, as the median over all sweeps. The result is 0 if
-    there are too few points."""
+    """Return the relative scatter of the points about a smooth curve: the median over G' and G'' of all sweeps. The
+    result is 0 if there are too few points."""
     each = [scatter(*merged(s.angular_frequency, G)) for s in sweeps for G in (s.storage, s.loss)]
     known = [own for own in each if np.isfinite(own)]
     return float(np.median(known)) if known else 0.0

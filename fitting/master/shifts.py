@@ -2,11 +2,11 @@
 
 The modulus at temperature T and frequency omega is 1 / b_T times the modulus at the reference temperature and frequency
 a_T omega. The curve is a cubic spline of log G' and of log G'' over log frequency. The curve and all factors are fitted
-together by least squares. So no model of the material is needed, and every factor has a standard error. If the noise of
-log G' and of log G'' differs, each has its weight. The distance between the knots of the spline is chosen from the
-data, because a curve that follows the noise would be steeper than the true curve. Then the errors of the factors, which
-depend on the slope of the curve, would be too small. Source: Ferry (1980), Viscoelastic properties of polymers, chapter
-11.
+together by least squares. So no model of the material is needed, and every factor has a standard error. If the noise
+differs between log G' and log G'', they get different weights. The distance between the knots of the spline is chosen
+from the data, because a curve that follows the noise would be steeper than the true curve. Then the errors of the
+factors, which depend on the slope of the curve, would be too small. Source: Ferry (1980), Viscoelastic properties of
+polymers, chapter 11.
 """
 
 from collections.abc import Sequence
@@ -27,9 +27,9 @@ LONGEST, CONVERGED = 0.3, 1e-6
 #: Settings for the first estimate of a shift. OVERLAP: minimum fraction of a sweep that must overlap with the
 #: neighbouring sweep. REACH: shifts that are tried [decades].
 OVERLAP, REACH = 0.25, np.linspace(-8.0, 8.0, 801)
-#: G' and G'' have different weights if chance makes their distances from the curves so different with a probability
-#: below CHANCE. ROUNDS: maximum number of fits, each followed by new weights. SETTLED: the fits end if no weight
-#: changes by more than this fraction. MOST: largest ratio of the weights.
+#: CHANCE: G' and G'' get different weights if the probability that their distances from the curves differ so much by
+#: chance is below this value. ROUNDS: maximum number of fits, each followed by new weights. SETTLED: the fits end if no
+#: weight changes by more than this fraction. MOST: largest ratio of the weights.
 CHANCE, ROUNDS, SETTLED, MOST = 1e-3, 8, 0.02, 100.0
 #: Two sweeps match within the noise if their mean square distance, divided by the variance of their noise, is at most
 #: this value.

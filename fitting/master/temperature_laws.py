@@ -13,8 +13,8 @@ import scipy.optimize
 
 from fitting.master.shifts import Shifts
 
-#: GAS: molar gas constant [J / (mol K)]. LEAST: standard error [decades]. Its square is added to the variances of given
-#: shift factors. For fitted shift factors, a tenth of LEAST is used.
+#: GAS: molar gas constant [J / (mol K)]. LEAST: additional standard error [decades] of log10 a_T. Its square is added
+#: to the variances of given shift factors. For fitted shift factors, a tenth of LEAST is used.
 GAS, LEAST = 8.314462618, 0.01
 
 

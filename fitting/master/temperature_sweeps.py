@@ -78,7 +78,7 @@ def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, flo
     if "temperature" in raw:
         T = raw["temperature"]
     else:
-        # A hyphen after a letter or a digit separates words ("Sweep-25C"). There it is not a minus sign.
+        # A hyphen after a letter or a digit separates words ("Sweep-25C"), so it is not a minus sign.
         stated = re.search(r"((?:(?<![^\W_])-)?\d+(?:[.,]\d+)?)\s*°?\s*([CK])\b", name)
         if stated is None:
             raise InputError(

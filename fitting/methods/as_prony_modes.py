@@ -40,8 +40,8 @@ def _columns_of_modes(omega: np.ndarray, times: np.ndarray, solid: bool) -> np.n
 def convert(
     moduli: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], low: float, high: float, solid: bool
 ) -> Conversion:
-    """Find the smallest number of modes with an error below `ALLOWED`. If the error is larger with every number up to
-    `MOST`, use the modes with the smallest error.
+    """Convert a model to the smallest number of modes whose error is below `ALLOWED`. If no number up to `MOST` reaches
+    this error, the modes with the smallest error are used.
 
     Args:
         moduli: function from angular frequencies (n,) [rad/s] to G' and G'' (n,) [Pa].

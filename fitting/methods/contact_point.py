@@ -58,8 +58,8 @@ def fit_contact(
     Args:
         depth: (n,) [m].
         force: (n,) [N].
-        unit_force: function that returns the force per unit modulus (n,) [N/Pa] for depths (n,) [m] from the contact
-            point on. These depths are negative before contact.
+        unit_force: function that returns the force per unit modulus (n,) [N/Pa] for depths (n,) [m] that are measured
+            from the contact point. Before contact, these depths are negative.
         base: model of the force without contact: "zero", "constant" (unknown offset of the sensor) or "line" (the
             sensor also drifts).
     """

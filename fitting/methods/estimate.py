@@ -178,8 +178,8 @@ def mesh_bias(found: Solution, natural_of: Callable[[jax.Array], jax.Array], mis
     of the n simulated data due to the meshes, divided by the noise. The same function is used for errors of time steps.
 
     The change of the unknowns u is J^+ `missing`, with the Jacobian J of the residuals. This estimate is accurate if
-    the errors are below 25 % and the parameters are not nearly dependent. Subtract the result once to correct the
-    parameters.
+    the errors are below 25 % and the parameters are not nearly dependent. To correct the parameters, subtract the
+    result only once.
     """
     J, (_, to_natural) = np.asarray(found.jacobian), with_slope(natural_of, found.u)
     if not (np.all(np.isfinite(J)) and np.all(np.isfinite(missing))):
@@ -188,8 +188,8 @@ def mesh_bias(found: Solution, natural_of: Callable[[jax.Array], jax.Array], mis
 
 
 def bias_sentences(estimate: Estimate) -> list[str]:
-    """Return warnings if the mesh or the time step changes a parameter by more than its standard error, or too much for
-    a first-order estimate. Another warning is returned if the data do not determine a parameter."""
+    """Return warnings if the mesh or the time step changes a parameter by more than its standard error, or by too much
+    for a first-order estimate. Another warning is returned if the data do not determine a parameter."""
     of_mesh = _sentences_of(estimate, estimate.mesh_bias, ("the mesh", "mesh_bias", "refine the mesh"))
     steps = ("the time step", "time_step_bias", "use smaller time steps")
     return list(dict.fromkeys([*of_mesh, *_sentences_of(estimate, estimate.time_step_bias, steps)]))

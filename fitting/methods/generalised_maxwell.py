@@ -78,8 +78,8 @@ _FARTHEST = 30.0
 
 
 def _times_of_gaps(u: Array) -> Array:
-    """Return descending relaxation times (N,) [s] from log(first time) and the logs of the differences between log
-    times."""
+    """Return descending relaxation times (N,) [s]. u contains the log of the longest time, then the logs of the
+    differences between neighbouring log times."""
     xp = arrays_of(u)
     apart = xp.exp(xp.minimum(u[..., 1:], _FARTHEST))
     gaps = xp.concatenate([xp.zeros_like(u[..., :1]), xp.cumsum(apart, axis=-1)], axis=-1)
@@ -202,8 +202,8 @@ def refuse_impossible(sweep: Sweep) -> Spectrum:
 
 def starts(sweep: Sweep, modes: int, dense: Spectrum, count: int = 24, seed: int = 0) -> np.ndarray:
     """Return starting points u (count, 2N + 1) of a search for N modes. The relaxation times of the first point are
-    evenly spread on the log axis. The second point has one time in each of N parts of the dense spectrum with equal
-    strength. The other points have random log-uniform times.
+    evenly spread on the log axis. For the second point, the dense spectrum is divided into N parts of equal strength,
+    and each part gives one time. The other points have random log-uniform times.
 
     For given times, the problem is linear in the strengths, so non-negative least squares gives the strengths.
     """

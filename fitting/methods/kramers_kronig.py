@@ -1,7 +1,7 @@
 """Checks of measured moduli without a model (causality, effects of the instrument), and a test of residuals.
 
-Every material that relaxes has a spectrum of terms with a relaxation time tau and a non-negative strength. With x =
-omega tau, the moduli of each term fulfil
+Every material that relaxes has a spectrum, which is a sum of terms. Each term has a relaxation time tau and a
+non-negative strength. With x = omega tau, the moduli of each term fulfil
 
     0 <= dG'/d ln(omega) <= G''      and      |dG''/d ln(omega)| <= G''
 
@@ -27,8 +27,8 @@ SIGNIFICANT, NEGLIGIBLE = 4.0, 0.002
 #: A warning is given if the relative distance of the best spectrum from the data is larger than FAR, and also larger
 #: than FAR_RATIO times the scatter.
 FAR, FAR_RATIO = 0.01, 5.0
-#: The misfit is called structured if the probability that random noise gives so few changes of sign of the residuals is
-#: below this value.
+#: The misfit is called structured if random residuals would have so few changes of sign with a probability below this
+#: value.
 CHANCE = 0.005
 
 
@@ -167,10 +167,9 @@ def _rounded_up(hertz: float) -> float:
     return math.ceil(hertz / unit) * unit
 
 
-#: _ONE_SIDED: nearly all residuals count as having one sign if the probability that so many random signs are equal is
-#: below this value.
-#: _OUTLIERS: residuals of the rarer sign are outliers if their mean size exceeds this many times the mean size of the
-#: others.
+#: _ONE_SIDED: nearly all residuals have one sign if so many random signs would be equal with a probability below this
+#: value. _OUTLIERS: residuals of the rarer sign are outliers if their mean size exceeds this many times the mean size
+#: of the others.
 _ONE_SIDED, _OUTLIERS = 1e-4, 3.0
 
 
@@ -178,8 +177,8 @@ def runs_probability(residuals: np.ndarray) -> tuple[int, float]:
     """Return the number of runs (groups of consecutive residuals with equal sign), and the probability of at most this
     number of runs if the signs were in random order (Wald and Wolfowitz 1940). If nearly all residuals (n,) have one
     sign, their order gives no information. Then the second result is the probability that at least so many of n random
-    signs are equal (two-sided sign test). If the residuals of the rarer sign are outliers, the result of the runs test
-    is kept.
+    signs are equal (two-sided sign test). If the residuals of the rarer sign are outliers, the probability of the runs
+    test is still returned.
     """
     residuals = np.asarray(residuals)[np.asarray(residuals) != 0]
     up = residuals > 0

@@ -16,7 +16,8 @@ from liverjax.solvers.blas import one_blas_thread
 
 
 class Solution(NamedTuple):
-    """Result of a search: a minimum of the cost |r|^2 / 2 of residuals r, or the unknowns u with the smallest cost."""
+    """Result of a search: a minimum of the cost |r|^2 / 2 of the residuals r. If the search has not converged, u has
+    the smallest cost so far."""
 
     u: Array
     residuals: Array
@@ -128,7 +129,8 @@ def solution(s: State) -> Solution:
 
 
 def degrees_of_freedom(jacobian: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return the degrees of freedom (K,) of K groups of residuals: their numbers minus the sums of their leverages.
+    """Return the degrees of freedom (K,) of K groups of residuals: for each group, the number of its residuals minus
+    the sum of their leverages.
 
     A group that the parameters fit exactly has 0 degrees of freedom (Cook and Weisberg 1982, Residuals and Influence in
     Regression).
@@ -163,7 +165,8 @@ def with_jacobian(residuals: Callable[..., jax.Array]) -> Callable[..., tuple[ja
 def levenberg_marquardt(
     residuals: Callable[..., jax.Array], start: jax.Array, *data: Any, max_iterations: int = 200
 ) -> Solution:
-    """Minimise |residuals(u, *data)|^2 / 2 inside jit. Use vmap over `start` or `data` for many fits at once."""
+    """Minimise |residuals(u, *data)|^2 / 2 inside jit. To run many fits at the same time, use vmap over `start` or
+    `data`."""
     evaluate = with_jacobian(residuals)
 
     def go_on(s):
@@ -251,8 +254,8 @@ def bfgs(residuals: Callable[..., jax.Array], start: jax.Array, *data: Any, gtol
     """Minimise |residuals(u, *data)|^2 / 2 by BFGS of `jax.scipy.optimize`. `gtol` is the tolerance for the gradient of
     the cost.
 
-    The line search of BFGS often ends at roundoff before gtol is reached. So convergence is judged in the same way as
-    for Levenberg-Marquardt: by the decrease of the cost that a least-squares step would still give.
+    The line search of BFGS often ends at roundoff before gtol is reached. So a fit has converged if an undamped
+    least-squares step would decrease the cost by at most 2e-4 times the cost.
     """
 
     def cost(u):

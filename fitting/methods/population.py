@@ -3,15 +3,16 @@
 The logarithm y_i of the parameter of sample i is normally distributed: y_i ~ N(mu, s^2 + e_i^2). Here, mu is the mean,
 s the standard deviation between samples (the spread) and e_i the error of y_i. The spread s is estimated by restricted
 maximum likelihood. The interval of mu follows Hartung and Knapp (2001), Statistics in Medicine 20. The interval of a
-new sample uses Student's t with n - 1 degrees of freedom. This is exact if the errors are small (Higgins, Thompson and
-Spiegelhalter (2009), J. R. Stat. Soc. A 172, use n - 2). If the errors e_i are so large that s is uncertain, a second
-interval is averaged over all possible s. The wider interval is used.
+new sample uses Student's t with n - 1 degrees of freedom. This interval is exact if the errors e_i are small. (Higgins,
+Thompson and Spiegelhalter (2009), J. R. Stat. Soc. A 172, use n - 2.) If the errors e_i are so large that s is
+uncertain, a second interval is computed as an average over all possible s. Then the interval of a new sample is
+extended until it contains both.
 
-Few samples determine s poorly. The values of the samples are moved towards the mean (shrinkage). The moved values are
-averages over all possible s. Their weights are the restricted likelihood and a half-Cauchy prior of scale 1 (Gelman
-2006, Bayesian Analysis 1, 515). The standard deviations of the moved values contain the errors of s and mu. The
-interval of Hartung and Knapp is too narrow if a few samples have most of the weight. Then the interval averaged over
-all possible s is used if it is wider.
+The values of the samples are moved towards the mean (shrinkage). Few samples determine s poorly, so the moved values
+are averages over all possible s. The weight of each s is the restricted likelihood times a half-Cauchy prior of scale 1
+(Gelman 2006, Bayesian Analysis 1, 515). The standard deviations of the moved values contain the errors of s and mu. The
+interval of Hartung and Knapp is too narrow if a few samples have most of the weight. Then both intervals are extended
+until they contain the intervals that are averaged over all possible s.
 """
 
 from typing import NamedTuple
@@ -108,8 +109,8 @@ class _Spreads(NamedTuple):
         return middle, np.sqrt(self.weight @ (variances + (at - middle) ** 2))
 
     def interval(self, share: float) -> tuple[float, float]:
-        """Return the 95 % interval of the mean. `share`: part of the variance between samples that is added; 1 gives
-        the interval of a new sample."""
+        """Return the 95 % interval of the mean. `share`: fraction of the variance between samples that is added to the
+        variance of the mean; 1 gives the interval of a new sample."""
         sd = np.sqrt(self.variance + share * self.s**2)
         ends = float(np.min(self.mean - 40 * sd)), float(np.max(self.mean + 40 * sd))
 
@@ -122,8 +123,8 @@ class _Spreads(NamedTuple):
 
 
 def _over_spreads(y: np.ndarray, v: np.ndarray) -> _Spreads:
-    """Return a grid of standard deviations s between samples. The weight of each value is the restricted likelihood
-    times the prior."""
+    """Return a grid of standard deviations s between samples. The weight of each s is the restricted likelihood times
+    the prior."""
     size = float(np.sqrt(np.var(y) + np.mean(v)))
     s = np.concatenate([[0.0], np.geomspace(1e-4 * size, max(100 * size, 30.0), 400)])
     w = 1 / (v + s[:, None] ** 2)

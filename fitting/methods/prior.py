@@ -1,10 +1,10 @@
 """The Matérn prior: a smooth random field on a mesh (Lindgren, Rue and Lindstroem 2011).
 
 The field m solves (kappa^2 - Laplace) m = white noise, with kappa = 1 / length. In three dimensions, this gives the
-covariance sd^2 exp(-distance / length). With the lumped mass M and the stiffness L of linear tetrahedra, the discrete
-solution is m = A^-1 M^(1/2) z. The entries of z are independent and standard normal, and A = (kappa^2 M + L) / (sd
-sqrt(8 pi kappa)). The normal derivative of m is 0 at the boundary. Therefore the standard deviation is larger there,
-and largest in corners.
+covariance sd^2 exp(-distance / length), where sd is the standard deviation. With the lumped mass M and the stiffness L
+of linear tetrahedra, the discrete solution is m = A^-1 M^(1/2) z. The entries of z are independent and standard normal,
+and A = (kappa^2 M + L) / (sd sqrt(8 pi kappa)). The normal derivative of m is 0 at the boundary. Therefore the standard
+deviation is larger there, and largest in corners.
 """
 
 import math

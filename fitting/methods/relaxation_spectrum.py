@@ -4,9 +4,9 @@ Where the data do not determine the strengths, the fitted strengths change smoot
 For fixed relaxation times, the moduli are linear in the strengths, so the fit has only one minimum. Each strength is
 divided by the measured |G*| at omega = 1 / tau. A weighted penalty on the second differences of the strengths makes
 them smooth. Method: Honerkamp and Weese (1989), Macromolecules 22. Grid and weight are chosen by the highest restricted
-likelihood (Wahba 1985, Ann. Stat. 13). The intervals from this choice contain the true values about as often as they
-should. The information criterion would choose a larger weight, and the intervals would contain the true values less
-often (`experiments/identification/coverage.py`).
+likelihood (Wahba 1985, Ann. Stat. 13). With this choice, the intervals contain the true values about as often as their
+confidence level states. The information criterion would choose a larger weight, and the intervals would contain the
+true values less often (`experiments/identification/coverage.py`).
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,8 @@ from fitting.readers.rheometer import Sweep
 GRIDS, MARGIN, WEIGHTS = (2, 3), 1.0, np.logspace(-6, 4, 31)
 #: The data determine a strength if its relative standard error is below this value.
 CARRIED = 0.5
-#: A warning is given if this fraction of the strengths between the first and the last one is zero.
+#: A warning is given if more than this fraction of the strengths is zero. Only strengths between the first and the last
+#: strength above zero count.
 GAPS = 0.1
 
 
@@ -58,8 +59,8 @@ def fit_all(sweeps: Sequence[Sweep]) -> list[GridSpectrum]:
 
 
 def at(sweep: Sweep, per_decade: int, smoothing: float, band: tuple[float, float] | None = None) -> GridSpectrum:
-    """Fit the spectrum for one grid and one weight. This convex problem is solved exactly. `band`: range of relaxation
-    times [s] that the data resolve; by default that of the sweep."""
+    """Fit the spectrum for one grid and one weight. This convex problem is solved exactly. `band`: shortest and longest
+    relaxation time [s] that the data resolve; by default, the band of this sweep."""
     omega = sweep.angular_frequency
     times = grid_of_times(*(band or sweep.resolved), per_decade)
     size = np.exp(np.interp(-np.log(times), np.log(omega), np.log(np.hypot(sweep.storage, sweep.loss))))

@@ -66,7 +66,8 @@ def moduli(u: Array, switches: Array, x: Array, angle: float = 0.5 * np.pi) -> t
     xp = arrays_of(u, x)
     alpha, beta, gamma = (exponent[..., None] for exponent in _orders(u))
     gamma, beta = switches[1] * gamma, switches[3] * beta
-    # E, V and W are logarithms of absolute moduli. Both springpots are divided by the softer one to prevent overflow.
+    # E, V and W are logarithms of absolute moduli. The compliance of each springpot is multiplied by the smaller of
+    # both moduli to prevent overflow.
     E, V, W = (u[..., k, None] + n * xp.log(x) for k, n in ((0, gamma), (2, alpha), (4, beta)))
     least = xp.where(switches[2] > 0, xp.minimum(V.real, W.real), V.real)
     own, in_row = xp.exp(least - V), switches[2] * xp.exp(least - W)
@@ -90,10 +91,10 @@ def times_of_modes(low: float, high: float) -> np.ndarray:
 def as_modes(u: Array, switches: Array, times: Array, reference: float) -> Maxwell:
     """Return many Prony modes that represent the relaxation spectrum of the model, for responses in the time domain.
 
-    The spectrum is H(tau) = Im G*(s) / pi at s = e^(i pi) / tau (Gross 1953). The trapezium rule in ln tau converts
-    the spectrum to modes, and converges exponentially. An equilibrium modulus replaces the modes that are slower
-    than `times`. One fast mode replaces the modes that are faster than `times`. Both are chosen so that G* is exact
-    at one small and one large real s.
+    The spectrum is H(tau) = Im G*(s) / pi at s = e^(i pi) / tau (Gross 1953). The trapezium rule in ln tau converts the
+    spectrum to modes, and converges exponentially. An equilibrium modulus replaces the modes that are slower than
+    `times`. One fast mode replaces the modes that are faster than `times`. The equilibrium modulus and the strength of
+    this fast mode are chosen so that G* is exact at one small and one large real s.
 
     Args:
         u, switches: see `moduli`.

@@ -85,13 +85,13 @@ def strain_response(model: Maxwell, time: jax.Array, stress: jax.Array) -> jax.A
 
 
 def relaxation_modulus(model: Maxwell, time: np.ndarray) -> np.ndarray:
-    """Relaxation modulus G(t) (n,) [Pa] after a step of strain."""
+    """Return the relaxation modulus G(t) (n,) [Pa] after a step of strain."""
     decay = 1 - np.exp(-np.asarray(time)[:, None] / np.asarray(model.relaxation_times))
     return np.asarray(model.shear_modulus) * (1 - decay @ np.asarray(model.ratios))
 
 
 def creep_compliance(model: Maxwell, time: np.ndarray) -> np.ndarray:
-    """Creep compliance J(t) (n,) [1/Pa] after a step of stress."""
+    """Return the creep compliance J(t) (n,) [1/Pa] after a step of stress."""
     rates, weights = retardation(Maxwell(*map(np.asarray, model)))
     one, _ = _phi(np.asarray(time)[:, None] * rates)
     return (1 + np.asarray(time) * (one @ weights)) / np.asarray(model.shear_modulus)

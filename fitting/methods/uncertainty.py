@@ -75,7 +75,7 @@ _SOFT = 0.01
 
 
 def may_be_fluid(u: Estimate) -> bool:
-    """Return whether the equilibrium modulus is so small, or so uncertain, that a fluid may explain the data as
+    """Return whether the equilibrium modulus is so small, or so uncertain, that a fluid may explain the data equally
     well."""
     return not _equilibrium(u) > max(2 * equilibrium_error(u), _SOFT * u.values[0])
 
@@ -104,7 +104,7 @@ def equilibrium_change(values: np.ndarray, moved: np.ndarray) -> np.ndarray:
 
 
 def has_profile(found: Solution, uncertainty: Estimate) -> bool:
-    """Return whether the fit is one of Prony modes of a solid, as `profile_intervals` needs."""
+    """Return whether the fitted parameters are the Prony modes of a solid. `profile_intervals` needs such a fit."""
     if len(found.u) < 3 or len(found.u) % 2 == 0:
         return False
     known = parameter_names((len(found.u) - 1) // 2)
@@ -123,7 +123,7 @@ def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, poin
             about four standard errors.
 
     Raises:
-        InputError: the fit is one of a fluid or of another model.
+        InputError: the fitted model is a fluid, or does not consist of Prony modes.
     """
     if not has_profile(found, uncertainty):
         raise InputError("profile intervals are for Prony modes of a solid: use the standard errors or the posterior")

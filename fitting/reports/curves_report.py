@@ -114,7 +114,7 @@ def fine(curve: Curve) -> Curve:
     """Return the deformations of a curve at `FINE` points along the curve, with a stress of zero.
 
     Between two measured points, the shears and the logarithms of the diagonal of F change linearly. So in a tension
-    test the lateral stretch stays lambda^(-1/2). F33 is scaled so that the volume stays the same.
+    test the lateral stretch stays lambda^(-1/2). F33 is scaled so that det F = 1.
     """
     at, places = np.linspace(0, len(curve.stress) - 1, FINE), np.arange(len(curve.stress))
     F = np.zeros((FINE, 3, 3))

@@ -1,8 +1,9 @@
 """Write Prony modes as material cards for liverjax, FEBio, Abaqus, Ansys and SOFA, in SI units (m, kg, s, Pa).
 
 All cards contain a neo-Hookean law. Its shear modulus is the instantaneous modulus G0; only the card for SOFA, which
-has no Prony series, contains the equilibrium modulus. The whole stress relaxes, as in the simulations here (part =
-"all"). A shear test does not determine the bulk modulus. The bulk modulus is computed from Poisson's ratio `POISSON`.
+has no Prony series, contains the equilibrium modulus (for a fluid: G0). The whole stress relaxes, as in the simulations
+here (part = "all"). A shear test does not determine the bulk modulus. The bulk modulus is computed from Poisson's ratio
+`POISSON`.
 """
 
 from pathlib import Path

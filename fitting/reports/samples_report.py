@@ -65,7 +65,8 @@ def _json_content(found: Samples) -> Content:
 
 
 def _times_of_strengths(found: Samples) -> Content:
-    """Return the relaxation time [s] of each strength of a spectrum (key: name of the strength)."""
+    """Return the relaxation time [s] of each strength of a spectrum, by the name of the strength, and the number of
+    relaxation times per decade."""
     out: Content = {}
     for fit in found.fits:
         names = (n for n in fit.kind.names if n.startswith("strengths["))
@@ -74,7 +75,7 @@ def _times_of_strengths(found: Samples) -> Content:
 
 
 def _labels(found: Samples) -> dict[str, str]:
-    """Return for each parameter the name that is printed. A strength of a spectrum is named by its relaxation time."""
+    """Return the printed name of each parameter. A strength of a spectrum is named by its relaxation time."""
     times = _times_of_strengths(found)["relaxation_times"] if found.kind.effective is not None else {}
     return {n: f"strength at {times[n]:.3g} s" if n in times else n for n in found.populations}
 
@@ -124,7 +125,8 @@ COUNTED = (
 
 
 def warnings(found: Samples) -> list[str]:
-    """Return warnings about the population, and the number of samples that have each warning about single samples."""
+    """Return warnings about the population. For each kind of warning about single samples, also return a sentence that
+    counts the samples with this warning."""
     out = []
     for name, p in found.populations.items():
         own = np.array([found.values(k)[name][0] for k in range(len(found.fits))])
@@ -211,7 +213,7 @@ def table(found: Samples) -> str:
         middle, new = ends
         rows.append(f"{label:22s} {p.mean:10.4g} {100 * p.spread:5.0f} %   {middle:22s}   {new} {unit}".rstrip())
     every = [found.values(k) for k in range(len(found.fits))]
-    # `name`: the parameter that is present in most samples.
+    # `name`: the parameter whose value is above zero in most samples.
     name = max(found.populations, key=lambda n: sum(own[n][0] > 0 for own in every))
     rows.append(f"{'sample':32s} {'mean error':>10s}   {labels[name]}")
     for (fit, sweep), own in zip(_pairs(found), every, strict=True):

@@ -124,14 +124,14 @@ def _bias_by_name(u: Estimate, n: int, moved: np.ndarray | None) -> Content | No
 
 
 def band_sensitivity(fit: Fit) -> Content:
-    """Return the changes of the parameters if one end of the band is ignored, with the names of `standard_errors`. An
-    entry is None if too few points remained for a fit."""
+    """Return the changes of the parameters if one end of the band is ignored, under the same names as in
+    `standard_errors`. An entry is None if too few points remained for a fit."""
     changes = fit.details.get("band_sensitivity", {})
     return {part: None if found is None else by_stem(found) for part, found in changes.items()}
 
 
 def by_stem(flat: dict[str, float]) -> Content:
-    """Return values with the names of `standard_errors`: one list for ratios[0], ratios[1], …"""
+    """Return values under the same names as in `standard_errors`: one list for ratios[0], ratios[1], …"""
     out: Content = {}
     for name, value in flat.items():
         stem = name.split("[")[0]
@@ -165,7 +165,8 @@ def spectrum_rows(details: Content) -> list[str]:
 
 
 def own_rows(p: Estimate, kind: Kind, details: Content, marked: Iterable[str] = ()) -> list[str]:
-    """Return lines with the parameters of a model, and the error of its Prony modes. Names in `marked` get a star."""
+    """Return lines with the parameters of a model, and with the largest difference between the model and its Prony
+    modes. Names in `marked` get a star."""
     rows = []
     for name, value, error, unit in zip(p.names, p.values, p.standard_errors, kind.units, strict=True):
         if not name.startswith("strengths["):
@@ -271,8 +272,7 @@ def _nearest_of_all(fits: list[Fit]) -> str:
 
 
 def draw_moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
-    """Draw the data, the closed form (a fine line) and the simulation on `top`, and the relative differences on
-    `rest`."""
+    """Draw the data, the closed form (a line) and the simulation on `top`, and the relative differences on `rest`."""
     fit, closed = fits[-1], fits[0]
     f = sweep.angular_frequency / (2 * np.pi)
     fine = np.geomspace(f[0], f[-1], 400)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: CURVES: names of the two curves of a test over frequency. QUANTITIES: axis label for each kind of test.
+#: CURVES: names of the two curves of each test in the frequency domain. QUANTITIES: axis label for each kind of test.
 CURVES = {"sweep": ("G'", "G''"), "dispersion": ("phase velocity [m/s]", "attenuation [1/m]")}
 QUANTITIES = {
     "sweep": "modulus [Pa]",
@@ -169,8 +169,9 @@ def table(found: Together, relative: float) -> str:
 
 
 def _with_sizes(found: Together, relative: float) -> list[str]:
-    """Return a line with the total error of the first parameter. A second parameter is added: the one that depends most
-    on the sizes of the samples, if its error due to these sizes exceeds its error due to noise."""
+    """Return a line with the total error of the first parameter. Another parameter is added if its error due to the
+    sizes of the samples is not below its error due to noise. If there are several such parameters, the one with the
+    largest ratio of these errors is added."""
     shares = sizes_of_samples.shares_with_sizes(found, relative)
     whole, names = total_error.root_of_squares(shares), list(shares["noise"])
     if not names or not np.isfinite(whole[names[0]]):

@@ -5,10 +5,10 @@ stress has relaxed. Moduli in this file are the moduli that the instrument repor
 moduli with the radius of the plates and the gap during the test.
 
 If the sample can slide sideways on the plates, it stays a cylinder. The cylinder has the stretches a along the radius
-and l along the axis, and the axial stress s. For an isotropic law, a shear between both directions has the modulus
-l^2 s / (l^2 - a^2) (Ericksen's relation; Rivlin 1949 for the incompressible cylinder). The part s of this modulus comes
-from the axial prestress. The remaining part, a^2 s / (l^2 - a^2), comes from the material. The torque is proportional
-to the fourth power of the radius. So the instrument reports
+and l along the axis, and the axial stress s. For an isotropic law, a shear between the axis and a lateral direction has
+the modulus l^2 s / (l^2 - a^2) (Ericksen's relation; Rivlin 1949 for the incompressible cylinder). The part s of this
+modulus comes from the axial prestress. The remaining part, a^2 s / (l^2 - a^2), comes from the material. The torque is
+proportional to the fourth power of the radius. So the instrument reports
 
     G*(omega) = a^4 s [a^2 / (l^2 - a^2) (1 - sum_k g_k / (1 + i omega tau_k)) + (1 - sum_k g_k)]
 
@@ -118,7 +118,7 @@ def smooth_force(law: Law, strain: float, radius: float) -> float:
 
 
 def _cauchy(law: Law, side: float, axial: float) -> np.ndarray:
-    """Principal Cauchy stresses (3,) [Pa] for the stretches `side`, `side` and `axial`."""
+    """Return the principal Cauchy stresses (3,) [Pa] for the stretches `side`, `side` and `axial`."""
     F = np.array([side, side, axial])
     return np.diagonal(np.asarray(law.first_piola(jnp.diag(F)))) * F / np.prod(F)
 
@@ -152,11 +152,12 @@ def compressed(rig: Rig, law: Law, strain: float, smooth: bool = False) -> Rig:
         rig: rig of the uncompressed sample. The height of the returned rig is the gap after the compression.
         law: law of the sample.
         strain: compression, as a fraction of the height at rest.
-        smooth: the sample slides sideways on the plates during the compression, so that it stays a cylinder. Otherwise
-            the sample is glued and bulges.
+        smooth: whether the sample slides sideways on the plates during the compression, so that it stays a cylinder.
+            Otherwise, the sample is glued and bulges.
 
     Raises:
-        InputError: the simulation does not converge at this compression, or `strain` is out of range.
+        InputError: the simulation does not converge at this compression, `strain` is out of range, or (if `smooth`) the
+            law is not isotropic.
     """
     check_strain(strain)
     if strain == 0:

@@ -8,9 +8,9 @@ modulus G:
 
     F(t) = integral of G(t - s) d f(d(s)).
 
-This is exact if strains are small and if the bulk modulus relaxes like the shear modulus or is much larger. For an
-indenter, the formula is valid only while the contact grows (Lee and Radok 1960, J. Appl. Mech. 27:438). At large
-strain, the formula is an approximation: Fung's quasi-linear viscoelasticity.
+This formula is exact if strains are small, and if the bulk modulus relaxes like the shear modulus or is much larger
+than it. For an indenter, the formula is valid only while the contact grows (Lee and Radok 1960, J. Appl. Mech. 27:438).
+At large strain, the formula is an approximation: Fung's quasi-linear viscoelasticity.
 """
 
 import tomllib
@@ -78,8 +78,8 @@ class Described(NamedTuple):
 
 def read_described(path: str | Path) -> TimeTest:
     """Read the described test and convert it to a test in shear, with the strain f(d)/S and the stress F/S. F is the
-    measured force. The area S is chosen so that a small strain (for sphere and cone: the largest strain) is d divided
-    by a length of the sample.
+    measured force. The area S is chosen so that a small strain equals d divided by a length of the sample. For sphere
+    and cone, this holds for the largest strain instead.
 
     Args:
         path: TOML file with the keys test, data (file with a table of time, displacement and force), and the sizes in
@@ -250,7 +250,7 @@ def _elastic(described: Described, largest: float, path: str) -> tuple[Callable[
 
 def _glued_curve(described: Described, largest: float, path: str) -> tuple[Callable[[float], float], float, list[str]]:
     """Compute f(d) by finite elements, corrected for the error of the mesh. Returns the same three values as
-    `_elastic`: f, the length that divides d, and notes."""
+    `_elastic`: f, the length [m] by which d is divided, and notes."""
     sizes, way = described.sizes, 1.0 if described.test == "tension" else -1.0
     radius, height = sizes["radius"], sizes["height"]
     if largest >= 0.5 * height:

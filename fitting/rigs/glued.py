@@ -41,13 +41,14 @@ class Cells(NamedTuple):
     """Sizes and kind of the elements of a rig's mesh. Results of the default mesh are within 1 % of converged results
     (experiments/TABLES.md)."""
 
-    size: float | None = None  # [m] cell length in a mesh of the whole cylinder; None: a graded sector
+    # Cell length [m] in a mesh of the whole cylinder (along the axis, up to twice this length); None: a graded sector.
+    size: float | None = None
     # In a sector: cell size at the rim of a plate, divided by the shortest dimension of the sample at this rim (radius,
     # half the height, …).
     rim: float = 0.04
     edge: float = 0.02  # in a sector: cell size at the edge of a punch, divided by the shortest dimension at this edge
     largest: float = 0.34  # in a sector: longest cells, divided by the radius; along the axis, twice this length
-    growth: float = cylinders.GROWTH  # in a sector: increase of the cell length per distance from rims and edge
+    growth: float = cylinders.GROWTH  # increase of the cell length per distance from rims and edge
     corners: int = 24  # number of corners of the polygon that replaces the circle; a sector has one of its sides
     order: int = 2  # order of the elements
     volumetric: str = "auto"  # how the elements treat volume changes, see `lj.Solve`
@@ -105,7 +106,7 @@ def _changed_by_mesh(rig: Rig, run: lj.Result) -> jax.Array:
 
 def reading_errors(rig: Rig, law: Law, prony: Prony | None) -> tuple[jax.Array, np.ndarray]:
     """Estimate how each reading (T,) [N] or [m] would change with an infinitely fine mesh (see `mesh_error`), and with
-    infinitely small time steps. The load rises during the first step of the rig, also with smaller steps."""
+    infinitely small time steps. With smaller time steps too, the load rises over the whole first step of the rig."""
     scene = _with(rig, law, prony)
     run = lj.simulate(scene, mesh_error=True)
     dt, steps = scene.solve.dt, scene.solve.steps
@@ -162,8 +163,8 @@ def tension(radius: float, height: float, dt: float, strains: Numbers, cell_size
         radius, height: size of the sample [m].
         dt: time step [s].
         strains: nominal strain (T,) at the end of each of T steps.
-        cell_size: `Cells`, or the edge length [m] of a mesh of the whole cylinder with cells of one size. Default: a
-            graded sector.
+        cell_size: `Cells`, or the cell length [m] of a mesh of the whole cylinder (see `Cells.size`). Default: a graded
+            sector.
 
     Raises:
         InputError: a length or a time is not positive, or a strain is not finite or is at most -0.9.
@@ -213,11 +214,11 @@ def indentation(
 def creep(
     radius: float, height: float, dt: float, steps: int, stress: float, cell_size: float | Cells | None = None
 ) -> Rig:
-    """Return the rig of a cylinder with a constant tensile stress `stress` [Pa] on its top from time 0 on.
+    """Return the rig of a cylinder that is loaded by a tensile stress `stress` [Pa] on its top.
 
     The stress is a force per original area. It acts everywhere on the top, without a plate; only the bottom is glued.
-    The stress rises during the first step, as in a rheometer. The reading is the mean displacement [m] of the top,
-    weighted with the area.
+    The stress rises during the first step, as in a rheometer, and is constant afterwards. The reading is the mean
+    displacement [m] of the top, weighted with the area.
 
     Raises:
         InputError: a length or a time is not positive, there are no steps, or the stress is not finite.

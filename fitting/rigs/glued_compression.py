@@ -6,9 +6,9 @@ elements of the torsion rig are 20 % too stiff; in pure torsion they are only a 
 and S (see below) and the force of the compression are computed with quadratic elements on the mesh of a quarter
 cylinder that is fine at the rims. This is done once for each law and strain.
 
-At each frequency, the stress of the sample is m = G*/G0 times the elastic stress. After a long time, the stress is
-m_inf times the elastic stress. Then the measured modulus is G0 (R m + S m_inf). The factors R and S come from two
-harmonic solutions about the compressed state. Other harmonic solutions agree with this formula within 1e-4.
+The stress of the oscillation is m = G*/G0 times the elastic stress. The stress of the compression has relaxed to m_inf
+times the elastic stress. So the measured modulus is G0 (R m + S m_inf). The factors R and S come from two harmonic
+solutions about the compressed state. Other harmonic solutions agree with this formula within 1e-4.
 """
 
 from typing import NamedTuple

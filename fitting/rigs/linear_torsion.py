@@ -187,8 +187,8 @@ def torque_for_strain(rig: Rig, modulus: Number, strain: Number) -> Number:
 
 
 def linear_moduli(law: Law, prony: Prony, omega: jax.Array, steps: int | None) -> jax.Array:
-    """Return the complex moduli (n,) [Pa] at small strain that the recursion (the update of the history variables
-    from step to step) gives. They are the limit of `torsion.moduli`.
+    """Return the complex moduli (n,) [Pa] at small strain that the recursion (the update of the history variables from
+    step to step) gives. They are the limit of `torsion.moduli` for small strain.
 
     In this limit, the rig is linear, and dividing by the bias removes the error of the mesh. So the moduli depend
     neither on the mesh nor on the plates. Up to an error of the order of the strain, their derivatives with respect to

@@ -137,11 +137,11 @@ def packed(rig: Rig, u: jax.Array, axial: jax.Array, arc: jax.Array) -> jax.Arra
 
 
 def rest_height(rig: Rig) -> jax.Array:
-    """Height of the sample [m] before the compression."""
+    """Return the height of the sample [m] before the compression."""
     z = rig.mesh.points[:, 2]
     return jnp.max(z) - jnp.min(z)
 
 
 def number_of_coordinates(rig: Rig) -> int:
-    """Number of coordinates of the rig."""
+    """Return the number of coordinates of the rig."""
     return 3 * (rig.mesh.number_of_nodes - rig.top - rig.bottom) + 1 + rig.free_height

@@ -13,8 +13,8 @@ from liverjax.scenes.scene import Scene
 
 
 def order_of_steps(scene: Scene) -> int:
-    """Return the order of the error of a run: the error is proportional to the time step to the power of this order. If
-    parts of the scene have different orders, the smallest order is returned."""
+    """Return the order p of the error of a run: the error is proportional to (time step)^p. If parts of the scene have
+    different orders, the smallest order is returned."""
     dynamic_euler = scene.solve.kind == "dynamic" and scene.solve.integrator == "euler"
     old_recursion = scene.viscosity is not None and scene.viscosity.scheme == "backward_euler"
     return 1 if dynamic_euler or old_recursion or scene.porosity is not None else 2
@@ -28,7 +28,8 @@ def change_with_small_steps(
     Args:
         scene: a scene with time steps, with known numbers (not inside jit, grad or vmap).
         readings: function from a run of T steps to its readings, with any shape (T, …).
-        run: the run of the scene, or of a scene with the same loads at the ends of these steps, if it is known already.
+        run: the run of this scene, if it is known already. The run may come from another scene that has the same loads
+            at the ends of the time steps.
 
     Returns:
         The change, in the shape of the readings. It is NaN if a run fails.

@@ -67,7 +67,7 @@ class Drive(NamedTuple):
     """Imposed load of the rig (the rheometer with its sample), and the number of steps. A change of any value compiles
     a new program.
 
-    `steps`: time steps per cycle. `cycles`: cycles of a run; the last one is demodulated. `by`: imposed quantity,
+    `steps`: time steps per cycle. `cycles`: cycles of a run; the last cycle is demodulated. `by`: imposed quantity,
     "torque" or "angle". `start`: initial state, "cycle" (the steady linear cycle) or "rest".
 
     The functions that use a drive raise `InputError` if `by` or `start` has another value.
@@ -164,7 +164,7 @@ class _Oscillation(NamedTuple):
         return 2 / self.dt * jnp.tan(self.omega * self.dt / 2)
 
     def positions(self, q: jax.Array) -> jax.Array:
-        """Positions (V, 3) [m] for all coordinates q."""
+        """Return the positions (V, 3) [m] for all coordinates q."""
         return sample_positions(self.rig, *coordinates(self.rig, q))
 
     def full(self, q: jax.Array, t: Number) -> jax.Array:
@@ -179,8 +179,8 @@ class _Oscillation(NamedTuple):
 
 
 class _Cycle(NamedTuple):
-    """The steady cycle of the rig linearised about rest (with time steps), and the preconditioner for the solution of a
-    step."""
+    """The steady cycle of the rig, linearised about rest and with the same time steps, and the preconditioner for the
+    solution of a time step."""
 
     steady: Response
     arc: Number | complex  # amplitude of the last coordinate [m]
@@ -188,7 +188,7 @@ class _Cycle(NamedTuple):
     twist: Number = 0.0  # [N] torque / radius at angle 0, subtracted: a compressed mesh is not quite symmetric
 
     def at(self, omega: Number, t: Number) -> jax.Array:
-        """Coordinates at time t [s]."""
+        """Return the coordinates at time t [s]."""
         return jnp.real(self.steady.shape * (self.arc * jnp.exp(1j * omega * t)))
 
 
@@ -322,7 +322,8 @@ def _initial(o: _Oscillation, shape: jax.Array, arc: Number | complex) -> tuple[
     if prony is not None and on_cycle:
         _, slope = jax.linearize(S, jnp.zeros_like(q))
         S_shape = slope(jnp.real(shape)) * arc
-        # A real shape needs only the first derivative. The second one would be a fifth of the compiled program.
+        # A real shape needs only the derivative along its real part. The other derivative would be a fifth of the
+        # compiled program.
         if jnp.iscomplexobj(shape):
             S_shape += slope(jnp.imag(shape)) * 1j * arc
         ratios = viscosity.complex_ratios(prony, o.omega, o.dt)

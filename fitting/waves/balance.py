@@ -251,7 +251,7 @@ def _factor_of_blocks(S: np.ndarray) -> np.ndarray:
 def _coupled_across(S: np.ndarray, k: int) -> bool:
     """Return whether a row up to k is coupled with a later row. S is stored by diagonals.
 
-    In a body of one part, the first tested column already shows a coupling, so the search ends at once.
+    In a body of one part, the first tested column already shows a coupling, so the search ends there.
     """
     return any(S[k - j + 1 :, j].any() for j in range(k, max(-1, k - len(S)), -1))
 

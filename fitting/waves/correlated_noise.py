@@ -1,5 +1,5 @@
-"""Estimate how much noise that is correlated between neighbouring voxels enlarges the errors of moduli, compared with
-white noise.
+"""Estimate the ratio of the errors of moduli due to correlated noise to the errors due to white noise. "Correlated"
+means: correlated between neighbouring voxels.
 
 Scanners and filters smooth the data, so the noise of neighbouring voxels is correlated. Then the data contain fewer
 independent values, and the estimate of the noise from fourth differences is too small. The residual motion d - u
@@ -26,8 +26,8 @@ import scipy.sparse
 from fitting.waves.balance import Balanced
 
 #: WIDTHS: standard deviations [voxels] of the Gaussian filters that are tried. DRAWS: number of random draws for each
-#: width in a body of SMALL voxels (inversely proportional to the number of voxels). REACH: half length of a filter
-#: [voxels].
+#: width in a body of SMALL voxels. In a body of n voxels it is DRAWS SMALL / n, but at least 1. REACH: half length of a
+#: filter [voxels].
 WIDTHS = (0.0, 0.35, 0.45, 0.55, 0.65, 0.75, 0.9, 1.1, 1.4, 1.8)
 DRAWS, SMALL, REACH = 6, 1500, 6
 #: The noise is regarded as correlated if the correlation of neighbouring residuals exceeds the correlation for white
@@ -40,7 +40,8 @@ class Correlation(NamedTuple):
 
     beyond: float  # correlation of neighbouring residuals minus that for white noise: the largest value of the 3 axes
     seen: bool  # whether this difference is larger than expected from white noise
-    # (R,) error of each modulus, divided by its error for white noise with the same sd (if `seen`: with the given sd)
+    # (R,) error of each modulus, divided by its error for white noise. The sd of this white noise is the given sd if
+    # `seen`, otherwise the sd of the noise itself.
     enlarged: np.ndarray
 
 

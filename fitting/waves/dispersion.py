@@ -25,7 +25,7 @@ WORDS = (
     ("speed", "velocity"),
     ("attenuation", "attenuation"),
 )
-#: Number of neighbouring points whose distance from a smooth curve (a cubic) shows the noise.
+#: Number of neighbouring points to which a cubic is fitted. The residuals of these fits show the noise.
 _NEIGHBOURS = 5
 #: Relative scatter below this value may be the curvature of exact data.
 CURVED = 3e-3
@@ -56,8 +56,8 @@ class Dispersion(NamedTuple):
     @property
     def scales(self) -> np.ndarray:
         """Values of smooth curves through the measured values, so errors divided by these scales are relative. If the
-        relative scatter of the attenuation differs much from that of the velocity, the scales of the attenuation are
-        multiplied by the ratio of the two."""
+        relative scatter of the attenuation differs from that of the velocity by more than chance explains, the scales
+        of the attenuation are multiplied by the ratio of the two scatters."""
         smooth = smooth_curve(self.angular_frequency, self.velocity)
         if self.attenuation is None:
             return smooth

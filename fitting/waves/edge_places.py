@@ -1,4 +1,4 @@
-"""Positions of the edges of labels between the voxels, and the uncertainty of these positions.
+"""Positions of the edges of regions between the voxel centres, and the uncertainty of these positions.
 
 The labels give one region for each whole voxel. Smoothed labels give the volume of a region, but the position of the
 edge has an error of a fraction of a voxel. For circles with a radius of 2.5 to 8 voxels, the error of the mean radius

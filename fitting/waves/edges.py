@@ -27,7 +27,7 @@ from fitting.waves.voxels import VoxelBody
 from liverjax.mesh.adjacency import PAIRS
 
 #: HALVINGS: number of times that the sides of cut elements are halved. In each of the resulting small tetrahedra, the
-#: edges of regions are planes. CHUNK: number of elements that are computed at once.
+#: edges of regions are planes. CHUNK: number of elements that are computed together.
 HALVINGS, CHUNK = 3, 60
 
 
@@ -35,7 +35,7 @@ class RegionMatrices(NamedTuple):
     """Matrices for the balance of forces with R regions.
 
     There are U unknowns: the 3 V displacements of the nodes, then the amplitudes of the kinks. C (I, U) is the matrix
-    of the force balance with I equations (see `fitting.waves.balance`). N is the number of its entries, and P is the
+    of the force balance with I equations (see `fitting.waves.balance`). N is the number of entries of C, and P is the
     number of pressures.
     """
 
@@ -99,8 +99,8 @@ def region_matrices(
         m, body: the result of `balance.matrices`, and the body for which this result was computed.
         density: [kg/m^3].
         s: smoothed indicator functions (R, V) from `edge_places.places`.
-        farther: the same functions with edges moved outwards by `edge_places.FARTHER`. If it is None, the edges stay
-            where the labels of the voxels change.
+        farther: the same functions with edges moved outwards by `edge_places.FARTHER`. If it is None, the edges have
+            the fixed positions that `s` gives.
     """
     nodes, tets = _nodes_of_elements(body), np.asarray(body.linear.tetrahedra)
     both = [s] if farther is None else [s, farther]

@@ -11,10 +11,11 @@ same effect as the mean of c.
 
 The prior standard deviation of c is increased step by step. The increase ends when chi^2 is as low as the number of
 equations (discrepancy principle; Morozov 1966), or when the logarithm of the evidence, -(chi^2/n + |z|^2)/2 - ln det H,
-decreases. Here z is the whitened field, and n is chi^2 divided by its expected value (at least 1). The Hessian is H = I
-+ J^H J/n, where J is the derivative of the whitened unbalanced forces with respect to z. The standard deviation with
-the highest evidence is used. For each standard deviation, the Gauss-Newton method minimises chi^2/2 + |z|^2/2. A search
-ends if the next step is shorter than `NEAR` standard deviations of the map.
+decreases. Here z is the whitened field: c and the levels, transformed so that the prior covariance is the unit matrix.
+n is chi^2 divided by its expected value (at least 1). The Hessian is H = I + J^H J/n, where J is the derivative of the
+whitened unbalanced forces with respect to z. The standard deviation with the highest evidence is used. For each
+standard deviation, the Gauss-Newton method minimises chi^2/2 + |z|^2/2. A search ends if the next step is shorter than
+`NEAR` standard deviations of the map.
 
 The uncertainty has two parts. The first part comes from the Hessian H. This part is larger if the noise of neighbouring
 voxels is correlated (`fitting.waves.correlated_noise`). The second part is needed because the position of a jump of the
@@ -64,7 +65,7 @@ class WaveMap(NamedTuple):
     sd: np.ndarray  # (F, P) complex. Real part: sd of ln |G|; imaginary part: sd of the loss angle
     posterior_sd: np.ndarray  # (F, P) sd of real and of imaginary part of c + l_f, without uncertainty of positions
     prior_sd: np.ndarray  # (F, P) sd of the same quantities before the data are used
-    draws: np.ndarray  # (D, F, P) complex: D posterior samples of c + l_f, at random positions within the width w
+    draws: np.ndarray  # (D, F, P) complex: D posterior samples of c + l_f, moved by random parts of the width w
     modulus: np.ndarray  # (F, P) complex [Pa]
     deviation: float  # chosen prior standard deviation of c
     length: float  # correlation length of the prior [m]
@@ -133,7 +134,7 @@ class Course(NamedTuple):
 
     def whitened(self, g: np.ndarray) -> np.ndarray:
         """Return T^T g, (P + L,) or (P + L, n), where T is the real matrix of `natural`. This converts a gradient with
-        respect to y to one with respect to z."""
+        respect to y into the gradient with respect to z."""
         c, levels = g[: self.corners], LEVEL * g[self.corners :]
         return np.concatenate([smooth.to_whitened(self.p, c.real) + 1j * smooth.to_whitened(self.p, c.imag), levels])
 
@@ -352,8 +353,8 @@ def _each_deviation(course, begun: _Begun, file, progress) -> list[tuple[_Reache
 
 
 def _next_start(course: Course, point: _Reached) -> _Reached:
-    """Return the map of `point`, with the whitened field z that gives this map for the next prior standard
-    deviation."""
+    """Return the state with which the search for the next prior standard deviation begins. Its map is that of
+    `point`, and its whitened field z is scaled."""
     return _reached(course, point.z * course.scales(point.k) / course.scales(point.k + 1), point.k + 1)
 
 
@@ -458,7 +459,7 @@ _HISTORY = ("deviation", "chi2_per_component", "steps", "seconds")
 
 
 def _write(file: Path | None, course: Course, begun: _Begun) -> None:
-    """Write the state of the search. The whole file is replaced at once, so the file on disk is always complete."""
+    """Write the state of the search. The file is replaced in one operation, so the file on disk is always complete."""
     if file is None:
         return
     with whole(file) as new, h5py.File(new, "w") as f:

@@ -11,7 +11,7 @@ from fitting.waves.files.unwrapping import unwrapped
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content, Numbers
 
-#: Units of displacements, and the factors that convert them to metres.
+#: Units of displacements, and the factors that convert them to metres. Phases in rad are not converted.
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9, "rad": 1.0}
 
 
@@ -93,8 +93,8 @@ def read_waves(
 
 
 def _of_replaced(name: str, found: Content, step: np.ndarray, unit: str | None) -> list[str]:
-    """Return notes if the unit in the file differs from the given `unit`, or its spacing from the spacing `step` [m]
-    that is used."""
+    """Return notes if the unit in the file differs from the given `unit`, or if the spacing in the file differs from
+    the spacing `step` [m] that is used."""
     stated = found.get("unit")
     told = []
     if unit and stated and unit != stated:
@@ -105,7 +105,7 @@ def _of_replaced(name: str, found: Content, step: np.ndarray, unit: str | None) 
 def _of_another_spacing(name: str, found: Content, step: np.ndarray) -> list[str]:
     if found.get("spacing") is None or formats.CONFLICT in found:
         return []
-    stated = _plain(name, "spacing", found["spacing"])  # it may be wrong, because it is not used
+    stated = _plain(name, "spacing", found["spacing"])  # this spacing is not used, so it was not checked
     if len(stated) in (1, 3) and np.allclose(stated, step, rtol=1e-3):
         return []
     return [
@@ -176,7 +176,7 @@ def _leave_out_rest(U: np.ndarray) -> list[str]:
 
 def with_noise(field: WaveField, noise: float | None) -> WaveField:
     """Return the field with `noise` [m] as the standard deviation of its noise. If `noise` is None, the estimated noise
-    of the field is kept. It must be above 0."""
+    of the field is kept. This estimate must be above 0 at every frequency."""
     if noise is not None:
         return field._replace(noise=np.full(len(field.frequencies), noise))
     unknown = ~(field.noise > 0)

@@ -30,10 +30,10 @@ def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namesp
     """Run a command and return its exit code. The exit code is 2 for unusable input or a full disk, and 130 for Ctrl-C.
 
     Compiled programs are kept on disk for the next command (see `liverjax.core.program_cache`). If `options` has
-    `optional_files`, a note lists those files in the folder of results that come from an earlier run.
+    `optional_files`, a note lists the optional files in the folder of results that come from an earlier run.
 
     Args:
-        run: runs the command with its options and returns 0 or 1.
+        run: function that runs the command with its options and returns 0 or 1.
         options: the parsed command line.
         resumable: whether an interrupted run can be continued with --resume.
     """
@@ -68,7 +68,7 @@ def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namesp
 
 
 def end_if_stopped(code: int) -> None:
-    """End the process at once if its exit code is that of Ctrl-C.
+    """End the process immediately if its exit code is `STOPPED` (Ctrl-C).
 
     JAX may still compute in another thread. Python would wait for that thread, and the process could end with a crash.
     """
@@ -79,8 +79,8 @@ def end_if_stopped(code: int) -> None:
 
 
 def _tell_of_earlier_files(options: argparse.Namespace, begin: float) -> None:
-    """If the folder of results contains optional files from before this run, print a note that names them. `begin`:
-    time at which this run began."""
+    """Print a note with the optional files in the folder of results that are older than this run. `begin`: time at
+    which this run began."""
     names = [name for name in getattr(options, "optional_files", ()) if _older(options.out / name, begin)]
     if names:
         verb = "is" if len(names) == 1 else "are"

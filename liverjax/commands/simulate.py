@@ -152,8 +152,8 @@ def _with_mesh_error(scene: "Scene", result: "Result") -> "Result":
 
 
 def _sizes_of_places(scene: "Scene") -> list[str]:
-    """Return one line with the area of each traction, and one line with the volume of each region. The user should
-    check these sizes, because only whole triangles and whole elements are selected."""
+    """Return one line per traction with its area, and one line per region with its share of the volume. The user
+    should check these sizes, because only whole triangles and whole elements are selected."""
     import numpy as np
 
     from liverjax.mesh.surface import areas

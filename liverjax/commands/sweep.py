@@ -48,7 +48,7 @@ def add(parsers: argparse._SubParsersAction) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the scene for the rows of the table. Return 1 if a row failed or the disk is full. Finished rows are kept."""
+    """Run the scene for the rows of the table. Return 1 if a row failed or a file could not be written."""
     import jax
     from tqdm import tqdm
 
@@ -145,7 +145,7 @@ def _share(given: list[str]) -> tuple[int, int]:
         else:
             jax.distributed.initialize()
         process = (jax.process_index(), jax.process_count())
-        # Runs need no communication. The runtime is shut down at once, so a failed process does not stop the others.
+        # Runs need no communication. The runtime is shut down here, so that a failed process does not stop the others.
         jax.distributed.shutdown()
     except (RuntimeError, ValueError) as error:
         reason = str(error).splitlines()[0]

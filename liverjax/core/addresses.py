@@ -58,7 +58,7 @@ def keep_loaded(package: str) -> None:
 
 
 def moved_module(package: str, name: str) -> ModuleType:
-    """Return the module with the old name PACKAGE.NAME.
+    """Import and return the module that has the old name PACKAGE.NAME.
 
     Raises:
         AttributeError: no module has this old name.

@@ -28,18 +28,18 @@ def check_fields(thing: Any, name: str = "", leave: tuple[str, ...] = ()) -> Non
         thing: any struct; structs inside this struct are also checked. Values that are None, or unknown inside jit, are
             not checked.
         name: name of the struct. The names in messages begin with this name: ``law`` gives ``law.mu``.
-        leave: fields that are not checked here, because another function checks them.
+        leave: fields that this function does not check, because another function checks them.
 
     Raises:
-        InputError: a value is out of bounds, not finite or not a number. The message contains its dotted name (for
-            example law.mu), the value, its bound and a remedy.
+        InputError: a value is out of bounds, not finite or not a number. The message contains the dotted name (for
+            example law.mu), the value, the bound and a remedy.
     """
     for dotted, metadata, value in _fields(thing, name, leave):
         check_bound(dotted, metadata, value)
 
 
 def _fields(thing: Any, name: str, leave: tuple[str, ...]) -> Iterator[tuple[str, Mapping, object]]:
-    """Yield dotted name, metadata and value of every field that has a bound or a unit, without the fields `leave`."""
+    """Yield (dotted name, metadata, value) of every field with metadata, also in nested structs, but not of `leave`."""
     for field in dataclasses.fields(thing):
         value = getattr(thing, field.name)
         if value is None or field.name in leave or (isinstance(value, dict) and field.name in _DICTIONARIES):
@@ -81,7 +81,7 @@ def check_bound(where: str, metadata: Mapping, value: object) -> None:
         return
     if type(value) is int and not finite(value):
         raise InputError(f"{where} is a whole number with hundreds of digits: give a smaller number")
-    if type(value) is float or type(value) is int:  # a faster way for single numbers, since every run checks all values
+    if type(value) is float or type(value) is int:  # a fast path for single numbers, since every run checks all values
         leaves, numbers = [value], None
         least = most = value
     else:
@@ -91,7 +91,7 @@ def check_bound(where: str, metadata: Mapping, value: object) -> None:
         numbers = _numbers_of(where, metadata, value, leaves)
         if not numbers.size:
             return
-        least, most = numbers.min(), numbers.max()  # NaN if one number is NaN
+        least, most = numbers.min(), numbers.max()  # both are NaN if one number is NaN
     above, upper = metadata.get("above"), metadata.get("upper")
     inside = (above is None or least > above) and (lower is None or least >= lower) and (upper is None or most <= upper)
     if not (inside and math.isfinite(least) and math.isfinite(most)) or metadata.get("nonzero"):
@@ -171,9 +171,9 @@ def finite(value: float) -> bool:
 
 
 def array_of(value: object) -> np.ndarray | None:
-    """Convert a number or lists of numbers from a scene file to a float array.
+    """Convert a number, or lists of numbers, from a scene file to a float array.
 
-    Returns None for strings, booleans, numbers that are not finite, and lists of unequal length.
+    Returns None for all other values, for example strings, booleans, NaN, and lists of unequal length.
     """
     if not _is_numbers(value):
         return None

@@ -1,9 +1,9 @@
-"""Compile a function for given arguments, and keep the compiled program (here: program) on disk.
+"""Compile a function for given arguments, and keep the compiled program (below: "program") on disk.
 
-Before JAX can find a compiled program in its own cache, it must trace the function (run the Python code without
-numbers). This takes seconds for a large function. Here a program is found without tracing: its file name contains a
-key, which is computed from the structure and the shapes of the arguments. The files are in the folder of
-`liverjax.core.program_cache`.
+Before JAX can find a program in its cache, it must trace the function, that is, run its Python code with abstract
+values instead of numbers. This takes seconds for a large function. This module finds a program without tracing: the
+file name of the program contains a key, which is computed from the structure and the shapes of the arguments. The files
+are in the folder of `liverjax.core.program_cache`.
 """
 
 import dataclasses
@@ -42,9 +42,10 @@ class _Unknown(Exception):
 
 
 def compiled(function: Callable[..., Any], *arguments: Any, short: bool = False) -> Callable[..., Any]:
-    """Compile `function` for arguments with these types and shapes, on one device. Return the compiled function.
+    """Return `function`, compiled for arguments with these types and shapes, on one device.
 
-    A call of the compiled function, with arguments of the same types and shapes, compiles nothing.
+    If the program is stored on disk, it is read and not compiled again. A call of the compiled function compiles
+    nothing; its arguments must have the same types and shapes.
 
     Args:
         function: a function at the top level of a module, or `functools.partial` of such a function. The keywords of

@@ -90,7 +90,8 @@ def check_times(times: Any, history: Any, name: str, forms: tuple[int, ...] = (1
     """Raise `InputError` if a history made in Python cannot be used. Times that are unknown inside jit are not checked.
 
     Raises:
-        InputError: only one of times and history is given, their shapes do not match, or the times do not increase.
+        InputError: only one of times and history is given, their shapes do not match, there is no time, or the times do
+            not increase.
     """
     if (times is None) != (history is None):
         raise InputError(f"{name} needs both times and history, or neither of them: give both, or remove both")

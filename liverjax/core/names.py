@@ -89,7 +89,7 @@ def walk(thing: Any, name: str, refusal: str) -> list[PathStep]:
 
 
 def _names_that_end_in(thing: object, name: str) -> list[str]:
-    """Return at most three dotted names in `thing` that end in `name`. Capitals and a unit in brackets are ignored."""
+    """Return up to three dotted names in `thing` that end in `name`. Letter case and a unit in brackets are ignored."""
     end = name.partition("[")[0].strip().lower()
     every = _names_of_numbers(thing) if end else ()
     return list(itertools.islice((own for own in every if f".{own}".lower().endswith(f".{end}")), 3))
@@ -118,7 +118,7 @@ def _keys(thing: Any, path: list[str], refusal: str, before: str) -> tuple[list,
     word, rest = path[0], path[1:]
     if dataclasses.is_dataclass(thing):
         return _keys_of_struct(thing, path, refusal, before)
-    if isinstance(thing, dict):  # a key may contain points, and an index of its array may follow
+    if isinstance(thing, dict):  # a key may contain dots; an index into its array may follow the key
         ends = (n for n in range(len(path), 0, -1) if ".".join(path[:n]) in thing)
         if end := next(ends, 0):
             return [".".join(path[:end])], path[end:]
@@ -155,7 +155,7 @@ def _is_whole(value: object) -> bool:
 
 
 def _is_place(word: str) -> bool:
-    """Return whether a word is an index, for example 2. The word 02 is not, so that each index has one name only."""
+    """Return whether a word is an index, such as 2. A word like 02 is not an index, so that each index has one name."""
     return word.isascii() and word.isdigit() and str(int(word)) == word
 
 

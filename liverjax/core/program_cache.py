@@ -1,6 +1,6 @@
-"""Keep compiled programs (here: programs) on disk, so that a machine compiles each program only once.
+"""Keep compiled programs (below: "programs") on disk, so that a machine compiles each program only once.
 
-JAX's own cache stores the programs, in a separate folder of the user's cache directory. The name of the folder depends
+JAX's cache stores the programs in a separate folder of the user's cache directory. The name of the folder depends
 on the versions of liverjax and JAX, on the source files and on the processor. So other versions, sources or machines
 never use these programs. The environment variable `LIVERJAX_CACHE` can name another folder; "off" means no cache.
 """
@@ -16,8 +16,8 @@ from importlib.metadata import version
 from pathlib import Path
 
 SWITCH = "LIVERJAX_CACHE"
-#: Maximum size of all programs on disk [bytes]. If the programs together are larger, the next command removes those
-#: that were not used for the longest time. A program takes 10 kB to 1 MB.
+#: Maximum total size of all programs on disk [bytes]. If the total is larger, the next command removes the least
+#: recently used programs. A program takes 10 kB to 1 MB.
 LIMIT = 500_000_000
 #: A program is stored only if its compilation takes at least this time [s]. Reading a program takes a few milliseconds.
 WORTH_KEEPING = 0.05
@@ -29,7 +29,7 @@ _in_use: list[Path] = []
 def folder() -> Path | None:
     """Return the folder in which programs are stored now.
 
-    Returns None outside of `kept_on_disk`, or if there is no cache.
+    Returns None outside of the context `kept_on_disk`, or if there is no cache.
     """
     return _in_use[-1] if _in_use else None
 
@@ -40,7 +40,7 @@ def kept_on_disk() -> Iterator[Path | None]:
 
     The context manager yields the folder of the cache, or None if there is no cache. There is no cache if
     `LIVERJAX_CACHE` is "off" or if the folder cannot be written. If the user has set a folder for JAX's cache
-    (`JAX_COMPILATION_CACHE_DIR`), JAX uses that folder, and there is no cache here. Programs that cannot be read are
+    (`JAX_COMPILATION_CACHE_DIR`), JAX uses that folder, and this cache is not used. Programs that cannot be read are
     compiled again.
     """
     chosen = _folder()
@@ -80,7 +80,7 @@ def _switch_on(folder: Path) -> None:
 
 
 def _folder() -> Path | None:
-    """Return the folder for these versions, source files and processor. The folder is made if it does not exist.
+    """Return the folder for these versions, source files and processor. Make this folder, and remove old programs.
 
     Returns None if this cache is not used: it is switched off, JAX uses another folder, or the folder cannot be
     written.

@@ -85,7 +85,7 @@ def unnamed(about: str = "", *, places: str = "", default: object = dataclasses.
 
     Args:
         about: one line about the field.
-        places: name of a method of the struct. For a given word, the method returns the indices of those entries of the
+        places: name of a method of the struct. For a given word, the method returns the indices of the entries of the
             field that have this word as their name. For example, `support.0` is the entry at the first index of
             ``named("support")``.
         default: see `dataclasses.field`.
@@ -124,12 +124,12 @@ def struct(cls: type[T]) -> type[T]:
     return made
 
 
-#: Names of fields whose values are arrays of whole numbers or of floating-point numbers. A user may give a list.
+#: Names of fields with arrays of whole numbers, and with arrays of floating-point numbers. A user may also give a list.
 _WHOLE, _FLOATING = frozenset(("nodes", "triangles", "elements", "drained")), frozenset(("times", "history"))
 
 
 def _with_arrays(make: Callable[..., None]) -> Callable[..., None]:
-    """Return the method `make` (__init__ of a struct) that converts lists to arrays (see `_WHOLE`)."""
+    """Return the method `make` (__init__ of a struct), changed such that it first converts lists to arrays."""
 
     def converted(name: str, value: list) -> Array:
         try:
@@ -148,5 +148,5 @@ def _with_arrays(make: Callable[..., None]) -> Callable[..., None]:
 
 
 def in_precision(value: Any, dtype: Any) -> Any:
-    """Return a leaf of a pytree in the precision `dtype` if it is a real number or an array of real numbers."""
+    """Convert a leaf of a pytree to the precision `dtype` if it is floating-point. Other leaves do not change."""
     return jnp.asarray(value, dtype) if jnp.issubdtype(jnp.result_type(value), jnp.floating) else value

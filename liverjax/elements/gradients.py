@@ -10,14 +10,14 @@ from liverjax.tensors.matrices import Matrix, Vector, cofactor, deformation_grad
 
 
 def volume_gradients(mesh: TetMesh, F: Matrix) -> list[Vector]:
-    """Derivatives dJ/dx_a = cof(F) D_a [1/m] at integration points, for corners a. D_a: shape function gradients."""
+    """Return dJ/dx_a = cof(F) D_a [1/m] at integration points for the corners a, with shape function gradients D_a."""
     cof = cofactor(F)
     g = [matvec(cof, tuple(mesh.gradients[a])) for a in range(3)]
     return [tuple(-(x + y + z) for x, y, z in zip(*g, strict=True)), *g]
 
 
 def volume_ratios(mesh: TetMesh, x: jax.Array) -> jax.Array:
-    """Volume ratios J of every element at positions x (V, 3) [m].
+    """Return the volume ratios J of every element at positions x (V, 3) [m].
 
     The shape is (1, E) for linear elements. For elements of higher order it is (Q + 4, E): Q integration points and 4
     vertices. Such an element can be inverted between its integration points although it is not inverted at these

@@ -37,13 +37,13 @@ _PAIRS = ((1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3))
 
 
 def energy(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
-    """Total strain energy [J] at positions x (V, 3) [m]."""
+    """Return the total strain energy [J] at positions x (V, 3) [m]."""
     law = mesh.at_points(law)
     return jnp.sum(mesh.weights * law.strain_energy(law.measures(deformation_gradient(mesh, x))))
 
 
 def nodal_force(mesh: TetMesh, P: Matrix) -> jax.Array:
-    """Nodal forces (V, 3) [N] due to first Piola-Kirchhoff stresses P [Pa].
+    """Return the nodal forces (V, 3) [N] due to first Piola-Kirchhoff stresses P [Pa].
 
     The force at corner a is the sum of V0 P D_a over the integration points, with volumes V0 and gradients D_a [1/m] of
     the shape functions.
@@ -57,7 +57,7 @@ def nodal_force(mesh: TetMesh, P: Matrix) -> jax.Array:
 
 @jax.jit
 def internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
-    """Gradient (V, 3) [N] of the total energy with respect to the positions: + dW/dx.
+    """Return the gradient (V, 3) [N] of the total energy with respect to the positions: + dW/dx.
 
     Args:
         mesh: `TetMesh`.
@@ -68,7 +68,7 @@ def internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
 
 
 def linear_force(mesh: TetMesh, law: Law, motion: jax.Array) -> jax.Array:
-    """Derivative (V, 3) [N] of `internal_force` at the reference shape in the direction of a motion (V, 3) [m].
+    """Return the derivative (V, 3) [N] of `internal_force` at the reference shape, along a motion (V, 3) [m].
 
     The deformation gradient and the sum at nodes are linear, so only the stress has to be differentiated.
     """
@@ -80,11 +80,11 @@ def linear_force(mesh: TetMesh, law: Law, motion: jax.Array) -> jax.Array:
 def element_stiffness(
     mesh: TetMesh, law: Law, x: jax.Array, regularised: bool = False, terms: str = "contracted"
 ) -> dict[tuple[int, int], Matrix]:
-    """Stiffness blocks {(a, b): K_ab} [N/m] of corners 1 <= a <= b <= 3: 45 different entries per integration point.
+    """Return stiffness blocks {(a, b): K_ab} [N/m] of corners 1 <= a <= b <= 3: 45 entries per integration point.
 
     `terms` is "contracted", or "chapter" for six terms per product g(I1, I2) h(J) of W
-    (`liverjax.laws.terms.chapter_terms`). The other blocks follow from the symmetry, K_ba = K_ab^T, and from K_0b =
-    -(K_1b + K_2b + K_3b).
+    (`liverjax.laws.terms.chapter_terms`). `regularised`: see `stiffness_matrix`. The other blocks follow from the
+    symmetry, K_ba = K_ab^T, and from K_0b = -(K_1b + K_2b + K_3b).
     """
     F, pairs = stored(deformation_gradient(mesh, x)), tuple((a - 1, b - 1) for a, b in _PAIRS)
     D = [tuple(mesh.gradients[a]) for a in range(3)]
@@ -121,7 +121,7 @@ _ENTRIES = [(a, b, r, c) for a, b in _PAIRS for r in range(3) for c in range(r i
 
 
 def _expansion() -> np.ndarray:
-    """Matrix (45, 144) that expands the 45 different entries of an element matrix to all 144 entries."""
+    """Return the matrix (45, 144) that expands the 45 different entries of an element matrix to all 144 entries."""
     basis = dict(zip(_ENTRIES, np.eye(45), strict=True))
     blocks = {
         (a, b): tuple(
@@ -140,7 +140,7 @@ _EXPANSION = _expansion()
 def element_matrices(
     mesh: TetMesh, law: Law, x: jax.Array, regularised: bool = False, terms: str = "contracted"
 ) -> jax.Array:
-    """Stiffness matrices (E, 9 n^2) [N/m] of elements with n nodes. Degree of freedom: 3 * local node + component."""
+    """Return stiffness matrices (E, 9 n^2) [N/m] of elements with n nodes. Row: 3 * local node + component."""
     K = element_stiffness(mesh, law, x, regularised, terms)
     entries = [K[a, b][r][c] for a, b, r, c in _ENTRIES]
     # A product with a constant matrix gives all 144 entries. Stacking the entries one by one triples the compile time.
@@ -149,7 +149,7 @@ def element_matrices(
 
 
 def of_nodes(order: int, corners: jax.Array) -> jax.Array:
-    """Matrices (E, 9 n^2) of elements with n nodes, from matrices (Q, E, 144) of corners at Q integration points."""
+    """Return matrices (E, 9 n^2) of elements with n nodes, from corner matrices (Q, E, 144) at Q integration points."""
     Q, E = corners.shape[:2]
     c = jnp.asarray(basis(order).c, corners.dtype)
     K = jnp.einsum("akq,qekilj,blq->eaibj", c, corners.reshape(Q, E, 4, 3, 4, 3), c)
@@ -157,7 +157,7 @@ def of_nodes(order: int, corners: jax.Array) -> jax.Array:
 
 
 def sparse(mesh: TetMesh, entries: np.ndarray) -> "scipy.sparse.csr_array":
-    """Assemble matrices (E, 9 n^2) of elements with n nodes to a matrix (3V, 3V), with row 3 * node + component."""
+    """Assemble matrices (E, 9 n^2) of elements with n nodes into a matrix (3V, 3V). Row: 3 * node + component."""
     import scipy.sparse  # imported here, since it takes a fifth of the package's import time
 
     nodes = mesh.element_nodes_on_host.T
@@ -170,12 +170,12 @@ def sparse(mesh: TetMesh, entries: np.ndarray) -> "scipy.sparse.csr_array":
 def stiffness_matrix(
     mesh: TetMesh, law: Law, x: jax.Array, regularised: bool = False, terms: str = "contracted"
 ) -> "scipy.sparse.csr_array":
-    """Second derivative of the total energy, a sparse matrix (3V, 3V) [N/m]. Degree of freedom: 3 * node + component.
+    """Return the second derivative of the total energy: a sparse matrix (3V, 3V) [N/m]. Row: 3 * node + component.
 
     Args:
         mesh, law, x: the same arguments as for `internal_force`.
-        regularised: use the regularisation of section 4.1.2 iii of the book chapter, modified such that it does not
-            change the trace. The regularisation changes the path of Newton's iterations, but not their solution.
+        regularised: whether to use the regularisation of section 4.1.2 iii of the book chapter, modified such that it
+            does not change the trace. It changes the path of Newton's iterations, but not their solution.
         terms: "contracted", or "chapter" for the six terms per product g(I1, I2) h(J) of the chapter. Both give
             the same matrix up to roundoff.
     """

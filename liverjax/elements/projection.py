@@ -44,7 +44,7 @@ _PAIRS = ((0, 1), (0, 2), (1, 2))
 
 
 class Frame(NamedTuple):
-    """Decomposition F = U diag(s) V^T with rotations U and V. The last, smallest s is negative if det F < 0."""
+    """Decomposition F = U diag(s) V^T with rotations U and V. The last s is the smallest; it is < 0 if det F < 0."""
 
     U: Matrix
     s: Vector
@@ -52,14 +52,14 @@ class Frame(NamedTuple):
 
 
 def frame(F: Matrix) -> Frame:
-    """Signed singular values of a tuple matrix F, the largest first, and their axes.
+    """Return the signed singular values of a tuple matrix F (the largest first) and their axes.
 
     The axes of singular values 0 are arbitrary.
     """
     _, axes = principal(F)
     n = list(transpose(axes))
     f = [matvec(F, a) for a in n]
-    for i, j in ((0, 1), (1, 2), (0, 1)):  # a swap with one sign changed keeps the axes right-handed
+    for i, j in ((0, 1), (1, 2), (0, 1)):  # a swap changes one sign, so that the axes stay right-handed
         swap = dot(f[j], f[j]) > dot(f[i], f[i])
         n[i], n[j] = _chosen(swap, n[j], n[i]), _chosen(swap, scale(-1.0, n[i]), n[j])
         f[i], f[j] = _chosen(swap, f[j], f[i]), _chosen(swap, scale(-1.0, f[i]), f[j])
@@ -92,7 +92,7 @@ def blocks(
     pairs: tuple[tuple[int, int], ...],
     volume: Scalars | None = None,
 ) -> list[Matrix]:
-    """Stiffness blocks in the form of `invariant_terms.blocks`, for an element matrix without negative eigenvalues.
+    """Return stiffness blocks like `invariant_terms.blocks`, such that the element matrix has no negative eigenvalue.
 
     Args:
         parts: pairs (weight, law). The energy is the weighted sum of the energies of the laws.
@@ -137,8 +137,8 @@ def blocks(
 def _by_subset(
     parts: list[tuple[Number, Law]], S: Matrix | None, F: Matrix, D: list[Vector], pairs: tuple, volume: Scalars | None
 ) -> list[Matrix]:
-    """Return the same as `blocks` if the regions have laws of different kinds. Each law is evaluated only in the
-    elements of its region."""
+    """Return the result of `blocks` for a body whose regions have laws of different kinds. Each law is evaluated only
+    in the elements of its region."""
     groups = next(law.subsets for _, law in parts if law.subsets is not None)
 
     def own(k: int) -> list[Matrix]:
@@ -157,7 +157,7 @@ def regularised(
     pairs: tuple[tuple[int, int], ...],
     volume: Scalars | None = None,
 ) -> list[Matrix]:
-    """Stiffness blocks with the regularisation of the chapter. Eigenvalues may still be negative (see `blocks`)."""
+    """Return stiffness blocks with the chapter's regularisation. Eigenvalues may still be negative (see `blocks`)."""
     result = [_diagonal_matrix(jnp.zeros_like(F[0][0]) if S is None else dot(D[i], matvec(S, D[j]))) for i, j in pairs]
 
     def with_more(weight: Number, state: invariant_terms.State | invariant_terms.Pieces) -> list[Matrix]:
@@ -180,7 +180,7 @@ def _diagonal_matrix(value: Any) -> Matrix:
 
 
 def _fibre(W4: Number, W44: Number, a: Vector, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
-    """Fibre stiffness 2 W_4 (a.D_i)(a.D_j) I + 4 W_44 (a.D_i)(a.D_j) Fa (x) Fa; negative eigenvalues are set to 0.
+    """Return the stiffness (a.D_i)(a.D_j) (2 W_4 I + 4 W_44 Fa (x) Fa) of a fibre. Negative eigenvalues are set to 0.
 
     W_4 and W_44 are derivatives with respect to the invariant I4, a is the fibre direction, and D_i are the gradients
     of the shape functions.

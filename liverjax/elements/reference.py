@@ -34,13 +34,13 @@ _VOIGT = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
 
 
 def energy(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
-    """Total strain energy [J] at positions x (V, 3) [m], computed from arrays of deformation gradients."""
+    """Return the total strain energy [J] at positions x (V, 3) [m], computed from arrays of deformation gradients."""
     return jnp.sum(mesh.weights * mesh.at_points(law).energy(_gradient(mesh, x)))
 
 
 @jax.jit
 def internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
-    """Gradient (V, 3) [N] of the total energy with respect to the positions, by reverse-mode differentiation."""
+    """Return the gradient (V, 3) [N] of the energy with respect to the positions, by reverse-mode differentiation."""
     return jax.grad(energy, argnums=2)(mesh, law, x)
 
 
@@ -55,13 +55,13 @@ def _hessians(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
 
 
 def stiffness_matrix(mesh: TetMesh, law: Law, x: jax.Array) -> "scipy.sparse.csr_array":
-    """Hessian (3V, 3V) [N/m] of the total energy, by forward-over-reverse differentiation of each element."""
+    """Return the Hessian (3V, 3V) [N/m] of the energy, by forward-over-reverse differentiation of each element."""
     return sparse(mesh, np.asarray(_hessians(mesh, law, x)))
 
 
 @jax.jit
 def standard_internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
-    """Nodal forces (V, 3) [N] of standard finite elements: B^T S with S = 2 dW/dC (B: `_strain_displacement`).
+    """Return nodal forces (V, 3) [N] of standard finite elements: B^T S with S = 2 dW/dC (B: `_strain_displacement`).
 
     Elements must not be inverted, because S is computed from C.
     """
@@ -91,15 +91,15 @@ def _standard_entries(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
 
 
 def standard_stiffness_matrix(mesh: TetMesh, law: Law, x: jax.Array) -> "scipy.sparse.csr_array":
-    """Stiffness (3V, 3V) [N/m] of standard finite elements, B^T D B + geometric part (Zienkiewicz and Taylor 2000).
+    """Return the stiffness (3V, 3V) [N/m] of standard finite elements: B^T D B plus the geometric stiffness.
 
-    Elements must not be inverted.
+    D contains the moduli dS/dE (Zienkiewicz and Taylor 2000). Elements must not be inverted.
     """
     return sparse(mesh, np.asarray(_standard_entries(mesh, law, x)))
 
 
 def _all_shape_vectors(mesh: TetMesh) -> jax.Array:
-    """Gradients of the shape functions: (E, 4, 3) for linear elements; otherwise (Q, E, n, 3): Q points, n nodes."""
+    """Return shape function gradients: (E, 4, 3) for linear elements, otherwise (Q, E, n, 3): Q points, n nodes."""
     D = jnp.transpose(mesh.shape_vectors, (2, 0, 1))
     D = jnp.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)
     return D if mesh.order == 1 else jnp.einsum("akq,ekj->qeaj", jnp.asarray(basis(mesh.order).c, D.dtype), D)
@@ -111,7 +111,7 @@ def _gradient(mesh: TetMesh, x: jax.Array) -> jax.Array:
 
 
 def _energy_of_C(law: Law, C: jax.Array) -> jax.Array:
-    """Energy W as a function of C. F is the transposed Cholesky factor of C (F^T F = C, J > 0), also with fibres."""
+    """Return the energy W as a function of C, at the transposed Cholesky factor F of C (F^T F = C, J > 0)."""
     return law.energy(jnp.swapaxes(jnp.linalg.cholesky(0.5 * (C + jnp.swapaxes(C, -1, -2))), -1, -2))
 
 
@@ -128,7 +128,7 @@ def _voigt(S: jax.Array) -> jax.Array:
 
 
 def _strain_displacement(F: jax.Array, D: jax.Array) -> jax.Array:
-    """Matrix B (..., E, 6, n, 3): derivative of Green's strain (shears doubled) with respect to n node positions."""
+    """Return B (..., E, 6, n, 3): derivatives of Green's strain (shears doubled) with respect to n node positions."""
     rows = []
     for i, j in _VOIGT:
         term = jnp.einsum("...k,...a->...ak", F[..., :, i], D[..., :, j])

@@ -59,8 +59,8 @@ def design(ranges: dict[str, tuple[float, float]], rows: int, kind: str = "sobol
         seed: random seed of "latin" and "sobol".
 
     Raises:
-        InputError: `kind` is unknown, `rows` is below 1, no parameter is given, or `rows` is too small for a grid with
-            two values of each parameter.
+        InputError: `kind` is unknown, `rows` is below 1, `seed` is below 0, no parameter is given, or `rows` is too
+            small for a grid with two values of each parameter.
     """
     from scipy.stats import qmc
 

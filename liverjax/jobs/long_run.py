@@ -1,8 +1,8 @@
-"""Run a scene in parts of some steps each. Finished parts stay on disk, so that a killed run can continue from them.
+"""Run a scene in parts of some steps each. Finished parts stay on disk, so that a killed run can continue.
 
-A folder next to the output has one file per part, with the results of its steps and the state after its last step.
-Every part begins with a new tangent matrix, also in a run that is not stopped. So a resumed run gives exactly the same
-numbers.
+A folder next to the output has one file per part. The file contains the results of the steps of this part, and the
+state after the last of these steps. Every part begins with a new tangent matrix, also in a run that is not stopped. So
+a resumed run gives exactly the same numbers.
 """
 
 import time
@@ -30,7 +30,7 @@ _ROWS = ("times", "positions", "reactions", "pressure", "status")
 
 
 class Ran(NamedTuple):
-    """A finished run and its computing time, which does not include parts that were read from disk."""
+    """A finished run and its computing time. This time does not include parts that were read from disk."""
 
     result: Result  # all arrays are NumPy arrays
     steps: int  # number of steps that were computed and not read from disk
@@ -81,7 +81,7 @@ def run(
 
     Raises:
         InputError: there are parts on disk and `resume` is false; the parts belong to another scene; another process
-            uses the parts.
+            uses the parts; or `every` is below 1.
         OSError: the disk is full; finished parts are kept.
     """
     steps, folder = scene.solve.steps, resumable_parts.beside(out)

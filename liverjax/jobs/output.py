@@ -1,4 +1,4 @@
-"""Write results to disk: HDF5, a series for ParaView, a picture."""
+"""Write results to disk: an HDF5 file, a series of files for ParaView, a picture."""
 
 import json
 from collections.abc import Mapping

@@ -17,7 +17,7 @@ from liverjax.simulation.run import Result, prepared
 
 
 def reaction_table(scene: Scene, result: Result) -> tuple[list[str], np.ndarray]:
-    """Return column names and rows of a table with time, and the force of each support on the body.
+    """Return the column names and rows of a table with the time and the force of each support on the body.
 
     For obstacles, the table also contains their displacement, and the maximum penetration depth of the surface.
     """

@@ -1,4 +1,4 @@
-"""Reduced models of scene files: make a model from training runs, and use the model for a run if its error is small."""
+"""Reduced models of scene files: make a model from training runs, and use it for a run if the error is small."""
 
 import time
 from pathlib import Path
@@ -67,7 +67,7 @@ def make(
 
 
 def tried(scene: Scene) -> Tried:
-    """Run a scene with the reduced model that its [solve] names, and estimate the error.
+    """Run a scene with the reduced model that is named in [solve] of the scene, and estimate the error.
 
     Raises:
         InputError: the model does not exist, or belongs to another scene.

@@ -89,7 +89,7 @@ def locked(file: Path) -> Iterator[None]:
 
 
 def same(identity: Mapping[str, object], file: Path) -> None:
-    """Store the input that determines the results, or compare it with the stored input of the parts on disk.
+    """Store the input that determines the results, or compare it with the input that is already stored.
 
     Raises:
         InputError: the parts next to `file` were made with other input, or their input is unknown.
@@ -113,7 +113,7 @@ def same(identity: Mapping[str, object], file: Path) -> None:
 
 
 def remove(folder: Path) -> None:
-    """Remove the folder and all of its files. The parts go first, so that a kill leaves no parts of unknown input."""
+    """Remove the folder and all of its files. The input file is removed last, so that no parts stay without it."""
     for file in sorted(folder.iterdir(), key=lambda file: file.suffix == ".json"):
         file.unlink(missing_ok=True)
     folder.rmdir()

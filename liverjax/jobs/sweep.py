@@ -2,8 +2,8 @@
 
 The table has one parameter set per row. The sets are run in chunks. A finished chunk is a separate file in
 FILE.h5.parts, which is written under a temporary name and then renamed. When all chunks are finished, they are joined
-to FILE.h5. So finished chunks are kept if a run is stopped, and `--resume` computes the others. Several processes may
-work on one sweep: each of n processes computes every n-th chunk, and the process that finishes last joins the parts.
+into FILE.h5. If a run is stopped, its finished chunks stay on disk, and `--resume` computes the other chunks. Several
+processes may work on one sweep: each of n processes computes every n-th chunk. The last process joins all parts.
 """
 
 import csv
@@ -99,7 +99,8 @@ def read_sweep(
     """Read a sweep from a scene file and a table with a header of dotted names. All rows are checked before any run.
 
     Raises:
-        InputError: the scene or the table cannot be used, a name is not in the scene, or a value is out of bounds.
+        InputError: the scene, the table or another argument cannot be used, a name is not in the scene, or a value is
+            out of bounds.
     """
     scene = load_scene(scene_file)
     names, rows = read_table(parameters)
@@ -205,7 +206,7 @@ def run(
 
     Args:
         sweep: `Sweep`.
-        out: file for the results. The parts stay next to it until all are finished.
+        out: file for the results. The parts stay next to it until all parts are finished.
         resume: whether to continue from the parts on disk.
         process: index of this process, and number of processes that share the work.
         report: function that is called after each chunk with the number of runs in it.
@@ -290,7 +291,7 @@ def _already(sweep: Sweep, out: Path, resume: bool) -> Done:
 
 
 def _joined(sweep: Sweep, out: Path, folder: Path, computed: int) -> Done:
-    """Join all parts to one file if all are finished. The process that finishes last does this."""
+    """Join all parts into one file if all parts are finished. The process that finishes last does this."""
     files = [resumable_parts.part(folder, k) for k in _chunks(sweep)]
     try:
         with resumable_parts.locked(folder / "lock_join"):

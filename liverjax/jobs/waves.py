@@ -43,7 +43,7 @@ class Waves(NamedTuple):
 
 
 def solved_waves(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
-    """Compute the motion of a scene of kind harmonic.
+    """Compute the harmonic motion of a scene with kind = "harmonic".
 
     Args:
         scene: `Scene`.
@@ -63,7 +63,7 @@ def solved_waves(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
     if mesh_error:
         try:
             error = harmonic_errors(scene, found, about=x)
-        except InputError as e:  # the waves are known
+        except InputError as e:  # the motion is known, only its mesh error is not
             said.append(str(e))
     if x is not None and reactions is not None:
         said += _of_rest(scene, x, reactions, f"--about {about}")
@@ -121,9 +121,9 @@ def _of_rest(scene: Scene, x: jax.Array, reactions: np.ndarray, name: str) -> li
 def missing_parts(scene: Scene, waves: Waves) -> tuple[np.ndarray, np.ndarray]:
     """Return the relative mesh errors of motion (F,) and of support forces (F,) at F frequencies.
 
-    The error of the motion is divided by the motion. The largest error of a support force is divided by the largest
-    support force. The errors are NaN at frequencies without motion or without force. The mesh error must have been
-    estimated before.
+    The norm of the error is divided by the norm of the motion. The largest error of a support force is divided by the
+    largest support force. The errors are NaN at frequencies without motion or without force. The mesh error must have
+    been estimated before.
     """
     error, found = waves.mesh_error, waves.found
     if error is None:

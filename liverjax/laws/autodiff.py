@@ -22,7 +22,7 @@ def derivative(function: Callable[[jax.Array], jax.Array], A: jax.Array) -> jax.
     """Differentiate an element-wise function of matrices A (…, n, m), by forward mode.
 
     The result has the shape of the function's values, followed by (n, m). In each direction, all elements are
-    differentiated at the same time, so that a law may have one parameter value for each element.
+    differentiated at the same time, so a law may have one parameter value for each element.
     """
     n, m = A.shape[-2:]
     directions = jnp.eye(n * m, dtype=A.dtype).reshape(n * m, n, m)

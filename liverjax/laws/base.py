@@ -39,11 +39,11 @@ class Law(Energies):
     """A hyperelastic law: energy per reference volume [Pa]. The module's docstring lists the methods to override."""
 
     def shear_modulus(self) -> Any:
-        """Ground-state shear modulus [Pa]."""
+        """Return the ground-state shear modulus [Pa]. Raise `InputError` if the law does not define this method."""
         raise InputError(f"law {type(self).__name__} has no ground-state shear modulus: define shear_modulus(self)")
 
     def bulk_modulus(self) -> Any:
-        """Ground-state bulk modulus [Pa]. This is `bulk` if all other energies of the law are isochoric."""
+        """Return the ground-state bulk modulus `bulk` [Pa]. Raise `InputError` if other energies may contribute."""
         if type(self).strain_energy is not Energies.strain_energy or self.green_energy is not None:
             raise InputError(f"law {type(self).__name__} has no ground-state bulk modulus: define bulk_modulus(self)")
         return 0.0 if self.bulk is None else self.bulk
@@ -92,18 +92,18 @@ class Law(Energies):
     # -- energy, stress and tangent ----------------------------------------------------------------------------------
 
     def energy(self, F: jax.Array) -> jax.Array:
-        """Strain energy density [Pa], shape (...), of deformation gradients (..., 3, 3)."""
+        """Return the strain energy density [Pa], shape (...), at deformation gradients (..., 3, 3)."""
         return self.strain_energy(self.measures(unpack(_floating(F))))
 
     def first_piola(self, F: jax.Array) -> jax.Array:
-        """First Piola-Kirchhoff stress dW/dF [Pa], shape (..., 3, 3), from hand-derived terms."""
+        """Return the first Piola-Kirchhoff stress dW/dF [Pa], shape (..., 3, 3), from hand-derived terms."""
         return pack(invariant_terms.first_piola(self, unpack(_floating(F))))
 
     def tangent(self, F: jax.Array) -> jax.Array:
-        """Tangent d2W/dF dF [Pa], shape (..., 3, 3, 3, 3).
+        """Return the tangent d2W/dF dF [Pa], shape (..., 3, 3, 3, 3).
 
-        It comes from the hand-derived stiffness between two nodes, with unit vectors instead of gradients of shape
-        functions.
+        It is computed with the hand-derived formula for the stiffness between two nodes, with unit vectors instead of
+        gradients of shape functions.
         """
         A = invariant_terms.tangent(invariant_terms.state(self, unpack(_floating(F))))
         rows = [[jnp.stack([pack(A[J][L]) for L in range(3)], axis=-1)] for J in range(3)]
@@ -190,11 +190,11 @@ class Sum(Law):
         return first, second
 
     def shear_modulus(self):
-        """Sum of the ground-state shear moduli of the laws [Pa]."""
+        """Return the sum of the ground-state shear moduli of the laws [Pa]."""
         return sum(law.shear_modulus() for law in self.laws)
 
     def bulk_modulus(self):
-        """Sum of the ground-state bulk moduli of the laws [Pa]."""
+        """Return the sum of the ground-state bulk moduli of the laws [Pa]."""
         return sum(law.bulk_modulus() for law in self.laws)
 
 
@@ -219,7 +219,7 @@ class Volumetric(Law):
         return None
 
     def strain_energy(self, I):
-        """Volumetric energy U(J) [Pa]."""
+        """Return the volumetric energy U(J) [Pa]."""
         if self.below is None:
             return volumetric(self.volumetric, self.bulk, I.J)[0]
         above = jnp.maximum(I.J, self.below)
@@ -227,7 +227,7 @@ class Volumetric(Law):
         return U + (U1 + 0.5 * U2 * (I.J - above)) * (I.J - above)
 
     def energy_derivatives(self, I):
-        """First and second derivative of U with respect to J."""
+        """Return the first and second derivative of U with respect to J."""
         above = I.J if self.below is None else jnp.maximum(I.J, self.below)
         _, U1, U2 = volumetric(self.volumetric, self.bulk, above)
         return {"J": U1 if self.below is None else U1 + U2 * (I.J - above)}, {("J", "J"): U2}
@@ -237,7 +237,7 @@ class Volumetric(Law):
         return 0.0
 
     def bulk_modulus(self):
-        """Bulk modulus K [Pa]. At rest, the second derivative of every form of U is K."""
+        """Return the bulk modulus K [Pa]. At rest, the second derivative of every form of U is K."""
         return self.bulk
 
 

@@ -47,7 +47,7 @@ class ByRegion(Law):
         return self.each(lambda law: law.isochoric_part())
 
     def volumetric_part(self) -> Any:
-        """Return the volumetric parts of all laws. Returns None if none of the laws has a volumetric part."""
+        """Return the volumetric parts of all laws; K = 0 for a law without this part. Returns None if no law has it."""
         if all(law.volumetric_part() is None for law in self.laws):
             return None
         return self.each(lambda law: law.volumetric_part() or Volumetric(bulk=0.0))
@@ -57,7 +57,7 @@ class ByRegion(Law):
         return tuple(self.piece(k).measures(in_subset(self.subsets, k, F)) for k in range(len(self.laws)))
 
     def strain_energy(self, I: tuple) -> jax.Array:  # type: ignore[override]
-        """Energy density (…, E) [Pa] of every element, from the law of its region."""
+        """Return the energy density (…, E) [Pa] of every element, from the law of its region."""
         return put_together(self.subsets, [self.piece(k).strain_energy(i) for k, i in enumerate(I)])
 
     def energy_derivatives(self, I: Any) -> Any:
@@ -65,9 +65,9 @@ class ByRegion(Law):
         raise InputError("laws of several kinds have no common derivatives: use the derivatives of each law")
 
     def shear_modulus(self) -> jax.Array:
-        """Ground-state shear modulus (E,) [Pa]."""
+        """Return the ground-state shear modulus (E,) [Pa]."""
         return put_together(self.subsets, [self.piece(k).shear_modulus() for k in range(len(self.laws))])
 
     def bulk_modulus(self) -> jax.Array:
-        """Ground-state bulk modulus (E,) [Pa]."""
+        """Return the ground-state bulk modulus (E,) [Pa]."""
         return put_together(self.subsets, [self.piece(k).bulk_modulus() for k in range(len(self.laws))])

@@ -13,9 +13,9 @@ from liverjax.tensors.matrices import determinant
 class Continued(Law):
     """A law of I1, I2 and J that is unchanged above J = c. Energy and stress are continuous at J = c.
 
-    Below c, an isochoric energy is evaluated at c^2/(2c - J) instead of J. This value is positive, so the isochoric
-    invariants exist. A volumetric energy is replaced by its second-order Taylor series at c. The energy increases
-    while an element is flattened and inverted.
+    Below c, the energy is evaluated at c^2/(2c - J) instead of J. This value is positive, so the isochoric invariants
+    exist. A separate volumetric energy U(J) is instead replaced by its second-order Taylor series at c. The energy
+    increases while an element is flattened and inverted.
     """
 
     law: Law = unnamed("the law that is continued")
@@ -47,7 +47,7 @@ class Continued(Law):
         return self._whole().measures(F)._replace(J=self._replaced(J)[0]), J
 
     def strain_energy(self, I):
-        """Energy [Pa] of the original law at the replaced J, plus the continued volumetric energy at J."""
+        """Return the energy [Pa] of the original law at the replaced J, plus the continued volumetric energy at J."""
         I, J = I
         W, volume = self._whole().strain_energy(I), self.volumetric_part()
         return W if volume is None else W + volume.strain_energy(I._replace(J=J))
@@ -70,15 +70,15 @@ class Continued(Law):
         return first, second
 
     def shear_modulus(self):
-        """Ground-state shear modulus [Pa] of the original law."""
+        """Return the ground-state shear modulus [Pa] of the original law."""
         return self.law.shear_modulus()
 
     def bulk_modulus(self):
-        """Ground-state bulk modulus [Pa] of the original law."""
+        """Return the ground-state bulk modulus [Pa] of the original law."""
         return self.law.bulk_modulus()
 
     def _whole(self) -> Law:
-        """Return the original law without its volumetric energy, or unchanged if its energy cannot be split."""
+        """Return the original law without its volumetric energy, or the whole law if its energy cannot be split."""
         part = self.law.isochoric_part()
         return self.law if part is None else part
 

@@ -29,7 +29,7 @@ def reduced(I: Invariants) -> tuple[Any, Any]:
 
 
 def split_derivatives(law: Any, I: Invariants) -> tuple[First, Second]:
-    """Return the derivatives of the energy w(Ibar1, Ibar2) with respect to I1, I2, J (book chapter, section 4.1.2)."""
+    """Return the first and second derivatives of w(Ibar1, Ibar2) with respect to I1, I2, J (chapter, section 4.1.2)."""
     m = I.J ** (-2 / 3)
     inverse_J = 1 / I.J
     Ibar = {"I1": m * I.I1} if "I1" in law.invariants else {}
@@ -61,7 +61,7 @@ def _isochoric_derivatives(law: Any, Ibar: dict) -> tuple[First, Second]:
 
 
 def autodiff_derivatives(law: Any, I: Invariants) -> tuple[First, Second]:
-    """Return the derivatives of `law.strain_energy` by forward mode, for a law that defines only its energy."""
+    """Compute the derivatives of `law.strain_energy` by forward mode, because the law defines only this energy."""
     values = {n: getattr(I, n) for n in ORDER if n in law.invariants}
     return _scalar_derivatives(lambda **v: law.strain_energy(I._replace(**v)), values)
 

@@ -83,7 +83,7 @@ class Energies:
     # -- arguments of the energies -------------------------------------------------------------------------------------
 
     def measures(self, F: Matrix) -> Invariants:
-        """Return the arguments of `strain_energy` at the deformation gradient F, a matrix of nested tuples."""
+        """Return the arguments of `strain_energy` at the deformation gradient F, a tuple matrix."""
         I = invariants(self.invariants, F)
         if "I4" in self.invariants:
             Fa = matvec(F, components(self.fibre, F[0][0]))
@@ -103,7 +103,7 @@ class Energies:
 
 
 def fibre_invariants(laws: tuple) -> dict[str, Energies]:
-    """Return a dictionary for a sum of laws: name of an invariant I4 = a . C a -> law with the fibre a."""
+    """Return {name of an invariant I4 = a . C a: law with the fibre direction a} for the laws of a sum."""
     if len(laws) == 1:
         return {"I4": laws[0]} if "I4" in laws[0].invariants else {}
     return {f"I4.{k}": law for k, law in enumerate(laws) if "I4" in law.invariants}

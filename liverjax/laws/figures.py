@@ -31,7 +31,7 @@ def curves(named: dict[str, Law], file: Path, stretches: tuple[float, float] = (
             style = ("-", "--", ":")[k // len(COLOURS) % 3]
             axis.plot(driven, stress, style, color=COLOURS[k % len(COLOURS)], label=name)
             ends.append((np.nanmin(stress), np.nanmax(stress)))
-        low, high = 3 * np.nanmedian(ends, axis=0)  # otherwise very large stresses would hide other curves
+        low, high = 3 * np.nanmedian(ends, axis=0)  # without these limits, very large stresses would hide other curves
         if low < high:  # this condition is false for NaN
             axis.set_ylim(max(low, axis.get_ylim()[0]), min(high, axis.get_ylim()[1]))
         axis.set(title=test.replace("_", " "), xlabel="amount of shear" if what == "shear" else "stretch")
@@ -46,7 +46,7 @@ def curves(named: dict[str, Law], file: Path, stretches: tuple[float, float] = (
 
 
 def gradient_check(result: Check, name: str, file: Path) -> None:
-    """Draw the errors of difference quotients as a function of the step, and the stress within the stable ranges."""
+    """Draw the errors of difference quotients as a function of the step, and the stress in stable ranges near rest."""
     figure, (left, right) = pyplot().subplots(1, 2, figsize=(10, 3.8), layout="constrained")
     for (label, errors), colour in zip(result.difference_errors.items(), (BLUE, ORANGE), strict=True):
         left.loglog(result.steps, errors, "o-", ms=3, color=colour, label=label)

@@ -41,12 +41,12 @@ def deformation_gradient(test: str, driven: Number, stretch: Any = 1.0) -> jax.A
 
 
 def nominal_stress(law: Law, F: jax.Array, constant: bool = False) -> jax.Array:
-    """First Piola-Kirchhoff stress (..., 3, 3) [Pa] of an incompressible sample without traction along axis 3.
+    """Return the first Piola-Kirchhoff stress (..., 3, 3) [Pa] of an incompressible sample, traction-free along axis 3.
 
     P = dW/dF - p cof F, with the pressure p for which P_33 = 0. The volumetric energy of a law does not contribute. A
-    law without a separate volumetric energy is evaluated at det F = 1. `constant` = True is allowed if F is given data,
-    so that no derivative with respect to F is needed. For a law of principal stretches, the derivatives with respect to
-    its parameters then need much less time.
+    law without a separate volumetric energy is evaluated at det F = 1. `constant` = True is allowed only if no
+    derivative with respect to F is needed, for example if F is measured. For a law of principal stretches, the
+    derivatives with respect to its parameters then need much less time.
     """
     split = law.isochoric_part()
     if constant and split is not None and split.stretch_energy is not None:

@@ -1,4 +1,4 @@
-"""Isotropic laws of layers without stress through the thickness, and of bars."""
+"""Isotropic laws of thin layers, which have no stress through the thickness, and of bars."""
 
 import dataclasses
 from typing import Any
@@ -11,7 +11,7 @@ from liverjax.core.struct import replace
 from liverjax.laws.base import Law
 from liverjax.laws.registry import create, find
 
-#: Number of iterations for the thickness stretch, and maximum change of its logarithm in one iteration.
+#: Number of iterations that find the thickness stretch, and maximum change of its logarithm in one iteration.
 _ITERATIONS, _LONGEST = 30, 0.5
 
 
@@ -49,13 +49,13 @@ def check(law: Law, name: str) -> None:
 
 
 def in_plane_energy(law: Law, C: tuple, solved: bool) -> jax.Array:
-    """Energy density (Q, m) [Pa] of a layer without stress through its thickness, at Q points of m elements.
+    """Return the energy density (Q, m) [Pa] of a layer without stress through its thickness, at Q points of m elements.
 
     Args:
-        law: isotropic law. If `solved` is False, the law is evaluated at J = 1. Otherwise it is evaluated at the J for
-            which the stress through the thickness is 0.
+        law: isotropic law.
         C: C_11, C_12, C_22 (Q, m) of the in-plane right Cauchy-Green tensor.
-        solved: whether the thickness stretch is an unknown.
+        solved: whether the thickness stretch is an unknown. Then the law is evaluated at the J for which the stress
+            through the thickness is 0. Otherwise it is evaluated at J = 1.
     """
     f11 = jnp.sqrt(C[0])
     f12 = C[1] / f11
@@ -91,6 +91,6 @@ def _thinned(density: Any, start: jax.Array) -> jax.Array:
 
 
 def axial_energy(law: Law, stretch: jax.Array) -> jax.Array:
-    """Energy density [Pa] of a bar in tension at constant volume, as a function of its stretch."""
+    """Return the energy density [Pa] of a bar in tension at constant volume, as a function of its stretch."""
     side, zero = 1 / jnp.sqrt(stretch), jnp.zeros_like(stretch)
     return law.strain_energy(law.measures(((stretch, zero, zero), (zero, side, zero), (zero, zero, side))))

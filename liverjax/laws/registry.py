@@ -110,14 +110,14 @@ def check_value(where: str, metadata: Any, value: Any) -> None:
 
 
 def typical(name: str) -> Law:
-    """Return the law with typical parameters, scaled to a ground-state shear modulus of 770 Pa (not measured)."""
+    """Return the law with typical (not measured) parameters, scaled to a ground-state shear modulus of 770 Pa."""
     values = {f.name: f.metadata["typical"] for f in parameters(find(name))}
     law = find(name)(**values)
     return scaled(law, 770.0 / law.shear_modulus())
 
 
 def scaled(law: Law, factor: Number) -> Law:
-    """Return the law with its energy multiplied by `factor`. Parameters in Pa are multiplied, the others are kept."""
+    """Return the law with its energy multiplied by `factor`. Only parameters in Pa change: they are multiplied."""
 
     def one(s: Law) -> Law:
         if isinstance(s, Continued):

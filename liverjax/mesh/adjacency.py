@@ -1,6 +1,6 @@
-"""Find nodes of a mesh that share an element, and patches of nearby nodes.
+"""Find the nodes of a mesh that share an element, patches of nearby nodes, and clusters of near nodes.
 
-Both are computed once per mesh, in NumPy (not in JAX).
+These data are computed once per mesh, in NumPy (not in JAX).
 """
 
 from typing import Any
@@ -20,9 +20,9 @@ PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 #: coarse matrix is dense with 12 unknowns per patch.
 PATCH_SIZE, FEW_PATCHES, LARGE_PATCH, MOST_PATCHES = 80, 32, 160, 192
 
-#: Clusters are groups of near nodes in thin elements. Two neighbours are near if their distance is below `NEAR` times
-#: the root mean square distance of each of the two to its neighbours. A cluster has at most `LARGEST_CLUSTER` nodes. A
-#: mesh has clusters if at least the fraction `SHARE` of its vertices has a near neighbour.
+#: Clusters are groups of near nodes in thin elements. Let r be the root mean square distance of a node from its
+#: neighbours. Two neighbours are near if their distance is below `NEAR` r for both nodes. A cluster has at most
+#: `LARGEST_CLUSTER` nodes. A mesh has clusters if at least the fraction `SHARE` of its vertices has a near neighbour.
 NEAR, LARGEST_CLUSTER, SHARE = 1 / 3, 26, 0.1
 
 
@@ -31,8 +31,8 @@ class Clusters:
     """Groups (clusters) of near nodes in thin elements, and the pairs of nodes that are coupled within a cluster.
 
     There are G clusters with at most M nodes. The matrix of a cluster has M x M blocks, one for each pair of members.
-    The block of the members a and b has the index a M + b. n is the number of coupled pairs of nodes. A pair occurs
-    once for each element that contains it, or once for each edge.
+    The block of the members a and b has the index a M + b. n is the number of coupled pairs of nodes. Clusters of
+    vertices have one pair for each edge. In clusters of shape functions, a pair occurs once for each common element.
     """
 
     nodes: jax.Array = param("1", "members of every cluster (G, M), padded with 0")
@@ -67,7 +67,7 @@ class Pattern:
 def pattern(tetrahedra: Indices, points: jax.Array) -> Pattern:
     """Return the pattern of elements (E, 4) with points (V, 3) [m]. Equal meshes give equal patterns.
 
-    The points may be unknown (inside jit, grad or vmap). Then all nodes are in one patch.
+    The points may be unknown (inside jit, grad or vmap). Then all nodes are in one patch, and there are no clusters.
     """
     number_of_nodes = points.shape[0]
     traced = isinstance(points, jax.core.Tracer)
@@ -108,7 +108,7 @@ def pattern(tetrahedra: Indices, points: jax.Array) -> Pattern:
 
 
 def node_numbers(of: Any) -> jax.Array:
-    """Return a copy of an array as 32-bit integers. NumPy copies it: JAX would compile a program for each shape."""
+    """Return a copy of an array as 32-bit integers. NumPy makes the copy. JAX would compile a program per shape."""
     return jax.device_put(np.asarray(of).astype(np.int32))
 
 
@@ -131,7 +131,7 @@ def patches(points: np.ndarray) -> np.ndarray:
 
 
 def _patch_functions(points: jax.Array, patch: np.ndarray) -> tuple[jax.Array, jax.Array]:
-    # NumPy is used if the positions are known. JAX would need a second to compile small programs for these operations.
+    # NumPy is used if the positions are known. JAX would need one second to compile these operations.
     xp: Any = jnp if isinstance(points, jax.core.Tracer) else np
     given: Any = points if xp is jnp else np.asarray(points)
     members = [given[patch == k] for k in range(int(patch.max(initial=0)) + 1)]
@@ -149,9 +149,9 @@ def vertex_clusters(points: np.ndarray, edges: np.ndarray) -> Clusters | None:
 
 
 def function_clusters(nodes: np.ndarray, places: np.ndarray, signs: np.ndarray) -> Clusters | None:
-    """Return the clusters of N shape functions, of which every element has n. Returns None if few elements are thin.
+    """Return the clusters of N shape functions (n functions in every element). Returns None if few elements are thin.
 
-    `nodes`, `signs` (n, E): numbers and signs of the functions of every element. `places` (N, 3) [m]: positions.
+    `nodes`, `signs` (n, E): numbers and signs of the functions of every element. `places` (N, 3) [m]: their positions.
     """
     a, b = np.triu_indices(len(nodes), 1)
     pairs, elements = np.stack([nodes[a], nodes[b]]).reshape(2, -1), np.tile(np.arange(nodes.shape[1]), len(a))
@@ -161,10 +161,10 @@ def function_clusters(nodes: np.ndarray, places: np.ndarray, signs: np.ndarray) 
 
 
 def near_groups(places: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Return the group number of every node (V,).
+    """Return the group number of every node (V,), from its position `places` (V, 3) [m] and neighbours `pairs` (2, N).
 
-    Two nodes belong to one group if they are connected by a chain of near nodes (see `NEAR`). `places` (V, 3) [m] are
-    the positions of the nodes, and `pairs` (2, N) are the pairs of neighbours. Groups that are too large are divided.
+    Two nodes belong to one group if they are connected by a chain of near nodes (see `NEAR`). Groups that are too large
+    are divided, and small groups are joined. If few nodes have a near neighbour, every group has only one node.
     """
     count, (one, other) = len(places), pairs
     square = np.sum((places[one] - places[other]) ** 2, axis=1)

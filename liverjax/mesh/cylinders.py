@@ -1,7 +1,7 @@
 """Meshes of cylinders with rings at given radii and layers at given heights, and sectors for axisymmetric problems.
 
 A ring is a regular polygon. Its corners lie a little outside the circle, so that the polygon and the circle have the
-same area. The error of a stiffness is then of fourth order in the angle between corners, not of second order.
+same area. The error of a computed stiffness is then of order 4, not 2, in the angle between neighbouring corners.
 """
 
 import itertools
@@ -49,8 +49,8 @@ def graded(length: float, cells: Mapping[float, float], largest: float, growth: 
 def graded_cylinder(radii: np.ndarray, heights: np.ndarray, match_area: bool = True) -> TetMesh:
     """Mesh a cylinder about the z axis, with rings of nodes at `radii` and layers of nodes at `heights`.
 
-    Edges around the axis are about as long as the width of the widest ring. The number of corners increases only across
-    wide rings. A thin ring has the same number of corners outside and inside.
+    Edges around the axis are about as long as the largest distance between neighbouring rings. The number of corners
+    increases from one ring to the next only if the distance between these rings is above half of this length.
 
     Args:
         radii: radii of the rings (n,) [m], increasing from 0 (the axis).
@@ -90,11 +90,11 @@ def sector(radii: np.ndarray, heights: np.ndarray, corners: int, slices: int = 1
     Args:
         radii, heights: see `graded_cylinder`.
         corners: number of corners of every ring of the whole cylinder, at least 3.
-        slices: number of edges of a ring in the sector; `corners` / 4 gives a quarter of the cylinder.
+        slices: number of edges of every ring in the sector; `corners` / 4 gives a quarter of the cylinder.
 
     Raises:
-        InputError: radii or heights do not increase, radii do not begin at 0, or the sector is half of the cylinder or
-            more.
+        InputError: radii or heights do not increase, radii do not begin at 0, or `slices` is below 1 or not below half
+            of `corners`.
     """
     radii, heights = _rising("radii", radii), _rising("heights", heights)
     if not 0 < 2 * slices < corners:
@@ -139,7 +139,8 @@ def _corners(radii: np.ndarray) -> np.ndarray:
     found, last = [], 6
     for k, w in enumerate(width):
         wanted = round(2 * np.pi * radii[k + 1] / edge)
-        # If a ring is thinner than half an edge, polygons with different numbers of corners would intersect.
+        # If the distance between two rings is below half an edge, polygons with different numbers of corners would
+        # intersect.
         if k == 0 or w > edge / 2:
             last = max(last, wanted)
         found.append(last)

@@ -94,8 +94,10 @@ def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
 
 
 def _without_other_nodes(points: np.ndarray, tets: np.ndarray, sets: tuple[dict, dict], name: str) -> tuple:
-    """Return points, elements, node sets and groups of triangles without the nodes that belong to no tetrahedron:
-    centres of arcs, reference points, shells. The program warns if there are such nodes."""
+    """Return points, elements, node sets and groups of triangles without the nodes that belong to no tetrahedron.
+
+    Such nodes are for example centres of arcs, reference points or nodes of shells. The program warns about them.
+    """
     used, (node_sets, groups) = np.unique(tets), sets
     if len(used) == len(points):
         return points, tets, node_sets, groups
@@ -275,7 +277,7 @@ def _middles(tets: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def _cell_groups(data: Any, cells: tuple[str, ...], dimension: int) -> dict[str, np.ndarray]:
-    """Return {name of a group: numbers of its cells}. Cells are numbered through all blocks whose type is in `cells`.
+    """Return {name of a group: numbers of its cells}. All blocks with a type in `cells` are numbered consecutively.
 
     A group of tetrahedra without a name is named by its number. A group of surface cells without a name is ignored.
     """
@@ -354,7 +356,7 @@ def _mask(numbers: object, size: int) -> np.ndarray:
 
 
 def meshio_cells(mesh: TetMesh) -> tuple[str, np.ndarray]:
-    """Return meshio's name of the cells, and the cells (E, 4) or (E, 10) in the order of VTK."""
+    """Return meshio's name of the cell type, and the node numbers (E, 4) or (E, 10) in the node order of VTK."""
     if mesh.order == 1:
         return "tetra", np.asarray(mesh.tetrahedra)
     nodes = mesh.element_nodes_on_host.T

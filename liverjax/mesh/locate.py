@@ -13,10 +13,11 @@ from liverjax.mesh.tetrahedra import TetMesh
 _INSIDE = 1e-9
 #: Two vertices coincide if their distance is below this fraction of the body's size.
 SAME_PLACE = 1e-9
-#: A vertex lies on a face if its distance is below _ON_FACE times the size of the face. For coordinates with six digits
-#: (relative roundoff _DIGITS), the allowed distance is up to a hundred times larger.
+#: A vertex lies on a face if its distance from the face is below a limit: `_ON_FACE` times the size of the face.
+#: Coordinates with six digits have the relative roundoff `_DIGITS`. If this roundoff is above the limit, it is the new
+#: limit, but at most 100 times the old limit.
 _ON_FACE, _DIGITS = 1e-5, 5e-6
-#: Only needle-like triangles have more vertices nearby.
+#: Maximum number of vertices near a triangle. Only needle-like triangles have more. Such triangles are not searched.
 _MOST_NEAR = 200
 #: A piece of a line is ignored if it is shorter than this fraction of the line.
 _SHORTEST = 1e-9
@@ -39,9 +40,9 @@ def doubled_vertices(mesh: TetMesh) -> int:
 
 
 def hanging_vertices(mesh: TetMesh) -> int:
-    """Return the number of vertices that lie inside a face or an edge of the boundary (hanging nodes). At such
-    vertices, the mesh is not connected, because each of them is a corner only of the elements on one side. Needle-like
-    triangles with more than `_MOST_NEAR` vertices nearby are not searched."""
+    """Return the number of vertices that lie on a face or an edge of the boundary, but not at its corners (hanging
+    nodes). At such vertices, the mesh is not connected, because they are corners only of the elements on one side.
+    Needle-like triangles with more than `_MOST_NEAR` vertices nearby are not searched."""
     from scipy.spatial import cKDTree  # slow to import
 
     points, triangles = np.asarray(mesh.points), np.asarray(boundary_triangles(mesh))
@@ -60,7 +61,7 @@ def hanging_vertices(mesh: TetMesh) -> int:
 
 
 def _on_triangle(p: np.ndarray, corners: np.ndarray, away: np.ndarray) -> np.ndarray:
-    """Return for n points p (n, 3) whether each lies on a triangle with the corners (n, 3, 3), but not at a corner.
+    """Return whether each of n points p (n, 3) lies on its triangle with corners (n, 3, 3), but not at a corner.
     `away` (n,): allowed distance, divided by the size of the triangle."""
     a, b, c = np.moveaxis(corners, 1, 0)
     normal = np.cross(b - a, c - a)

@@ -26,7 +26,7 @@ def integrals(mesh: TetMesh, density: jax.Array) -> jax.Array:
     """Integrate a density times the linear shape function of every vertex over the reference volume. Returns (V,).
 
     Args:
-        density: one number for each element (E,), or one number for each of Q integration points in it (Q, E).
+        density: one number for each element (E,), or one for each of the Q integration points of each element (Q, E).
     """
     if density.ndim == 1:
         return to_nodes(mesh, mesh.volumes * density / 4)
@@ -71,13 +71,13 @@ _INTEGRALS = {1: (1 / 4,), 2: (-1 / 20, 1 / 5), 3: (-1 / 20, 1 / 5)}
 
 @partial(jax.jit, inline=True)
 def nodal_volumes(mesh: TetMesh) -> jax.Array:
-    """Lumped mass divided by density (V,) [m^3]. In linear elements each vertex gets a quarter of the volume."""
+    """Return lumped mass divided by density (V,) [m^3]. In linear elements, a vertex gets a quarter of the volume."""
     return _weighted_parts(mesh, _LUMPED[min(mesh.order, 2)])
 
 
 @partial(jax.jit, inline=True)
 def load_volumes(mesh: TetMesh) -> jax.Array:
-    """Integrals of the shape functions (V,) [m^3]. They equal the nodal forces [N] of a uniform weight of 1 N/m^3."""
+    """Return the integrals of the shape functions (V,) [m^3]: the nodal forces [N] of a uniform weight of 1 N/m^3."""
     total = _weighted_parts(mesh, _INTEGRALS[mesh.order])
     if mesh.order < 3:
         return total

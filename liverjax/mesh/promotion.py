@@ -1,5 +1,5 @@
-"""Make quadratic meshes (a node at the middle of every edge) from linear ones, and cubic meshes from quadratic ones by
-additional shape functions on edges and faces."""
+"""Make quadratic meshes (with a node at the middle of every edge) from linear meshes, and cubic meshes from quadratic
+meshes. A cubic mesh has additional shape functions on edges and faces."""
 
 import jax
 import jax.numpy as jnp
@@ -42,8 +42,8 @@ def _points_and_middles(points: jax.Array, edges: jax.Array) -> jax.Array:
 def middles_of_set(mesh: TetMesh, name: str) -> np.ndarray:
     """Return the node numbers (V + edge number) of the edge middles that belong to a node set of the mesh.
 
-    If the mesh has a triangle set with the same name and the same vertices, the result contains the middles of the
-    edges of its triangles. Otherwise `middles_of_places` finds the edge middles.
+    If the mesh has a triangle set with the same name and the same vertices, the result contains the middles of all
+    edges of these triangles. Otherwise `middles_of_places` finds the edge middles.
     """
     V, nodes = mesh.number_of_vertices, np.asarray(mesh.node_sets[name])
     nodes = nodes[nodes < V]
@@ -62,10 +62,10 @@ def middles_of_places(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
     """Return the node numbers (V + edge number) of the edge middles on the regions that the vertices `nodes` form.
 
     A region consists of element faces with all their vertices in `nodes`, for example a fixed side of the body. Two
-    regions may meet at an edge of the body. A face at this edge can have all its vertices in the two regions without
-    belonging to one of them. On the surface, such a face is at an angle to the faces of the regions, and nearly
+    regions may meet at an edge of the body. A face at this edge may have all its vertices in `nodes`, but belong to
+    neither of the two regions. On the surface, such a face is at an angle to the faces of the regions, and nearly
     parallel to a neighbouring face outside the regions. If the positions of the mesh are unknown (inside jit, grad or
-    vmap), all faces on the surface belong to a region. Inside the body, a face belongs to a region only if one of its
+    vmap), such faces are not excluded on the surface. Inside the body, a face belongs to a region only if one of its
     vertices is below the surface, or has an edge to a vertex of `nodes` below the surface. Where the body is only one
     element thick, no vertex is below the surface. There, all faces with all their vertices in `nodes` belong to a
     region.
@@ -95,7 +95,7 @@ def middles_of_places(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
 
 
 def _and_neighbours(mesh: TetMesh, inside: np.ndarray) -> np.ndarray:
-    """Return the vertices `inside` (V,), and all vertices that an edge connects with one of them."""
+    """Return the mask `inside` (V,) of vertices, extended by all vertices that an edge connects with one of them."""
     low, high = np.asarray(mesh.pattern.edges)
     found = inside.copy()
     found[low[inside[high]]] = True
@@ -200,7 +200,7 @@ def with_faces(mesh: TetMesh, triangles: Indices) -> Indices:
 
 
 def with_functions(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
-    """Return the numbers of nodes (n,) of quadratic elements, followed by the numbers of functions of order 3.
+    """Return the node numbers `nodes` (n,) of quadratic elements, followed by the numbers of functions of order 3.
 
     These functions belong to the edges and faces that have all their nodes in `nodes`.
     """
@@ -222,7 +222,7 @@ def _nodes_of_face(face: tuple[int, ...]) -> list[int]:
 
 
 def on_middles(mesh: TetMesh, values: jax.Array) -> jax.Array:
-    """Add the values at middles of edges to vertex values (..., V) of a field that is linear along edges."""
+    """Append the values at the middles of edges to the vertex values (..., V) of a field that is linear along edges."""
     if mesh.order == 1:
         return values
     low, high = mesh.pattern.edges

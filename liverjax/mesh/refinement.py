@@ -22,8 +22,8 @@ def refined(mesh: TetMesh, near: Indices | None = None) -> TetMesh:
     may be unknown (inside jit, grad or vmap) if `near` is not given and the mesh has no triangle sets.
 
     Args:
-        near: node numbers (n,). If given, only the edges at these nodes are halved, and the edges that must also be
-            halved so that the mesh stays conforming. The result then has no element sets. An element is cut at its
+        near: node numbers (n,). If given, only two kinds of edges are halved: edges at these nodes, and edges that must
+            be halved to keep the mesh conforming. The result then has no element sets. An element is cut at its
             longest edge first (Rivara 1984), so elements do not become flatter. `rim` returns the nodes around a clamp,
             where most of the mesh error occurs.
     """
@@ -70,7 +70,7 @@ def quarters(mesh: TetMesh, triangles: Indices) -> jax.Array:
 def places_in(mesh: TetMesh, fine: TetMesh) -> tuple[np.ndarray, np.ndarray]:
     """Locate the V' nodes of `fine` = `refined(mesh)` in the original mesh.
 
-    Returns an element (V',) that contains each node, and the barycentric coordinates (4, V') of the node in it.
+    Returns, for each node, an element (V',) that contains it, and its barycentric coordinates (4, V') in this element.
     """
     corners = _places_of_parts()
     inside = np.concatenate([corners, corners[:, [i for i, _ in PAIRS]] / 2 + corners[:, [j for _, j in PAIRS]] / 2], 1)
@@ -105,9 +105,10 @@ def _triangles_in(triangles: np.ndarray, surface: np.ndarray, ends: np.ndarray) 
 
 
 def rim(mesh: TetMesh, nodes: Indices) -> np.ndarray:
-    """Return the nodes (m,) at the border of the surface region of nodes (n,). At this border, strain is largest.
+    """Return the nodes (m,) at the border of the surface region with nodes (n,).
 
-    Vertices that belong to no triangle of this region (single nodes, nodes inside the body) are returned too.
+    If the region is clamped, the strain is largest at this border. Vertices that belong to no triangle of the region
+    (single nodes, nodes inside the body) are returned too.
     """
     check_nodes(nodes, mesh.number_of_nodes, "rim: nodes", least=0)
     held = np.asarray(nodes)[np.asarray(nodes) < mesh.number_of_vertices]
@@ -147,10 +148,10 @@ def _by_length(mesh: TetMesh) -> np.ndarray:
 
 
 def _halved(mesh: TetMesh, near: np.ndarray) -> np.ndarray:
-    """Return which edges (N,) are halved.
+    """Return a mask (N,) of the edges that are halved.
 
-    First, edges at the nodes `near` are halved. Then the longest edge of each element and each face that has a halved
-    edge is halved too, until no edge is added.
+    First, edges at the nodes `near` are halved. If an element or a face has a halved edge, its longest edge is halved
+    too. This rule is applied until no edge is added.
     """
     edges, place = np.asarray(mesh.pattern.element_edges), _by_length(mesh)
     groups = [edges, *(edges[[k for k, pair in enumerate(PAIRS) if set(pair) <= set(face)]] for face in FACES)]

@@ -76,7 +76,7 @@ def _warn_of_millimetres(x: np.ndarray, key: str, bound: float, name: str) -> No
 
 
 def boundary_triangles(mesh: TetMesh, nodes: Indices | None = None) -> np.ndarray:
-    """Return the outer triangles (m, 3), with outward normals. If `nodes` is given, all vertices must be in `nodes`."""
+    """Return the outer triangles (m, 3), with outward normals. With `nodes`: only those with all corners in `nodes`."""
     tets = np.asarray(mesh.tetrahedra)
     faces = np.concatenate([tets[:, f] for f in FACES])
     codes = face_codes(np.sort(faces.astype(np.int64), axis=1), mesh.number_of_vertices)

@@ -131,7 +131,7 @@ def _disc(rings: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _not_too_many(tetrahedra: int, names: str) -> None:
-    """Raise `InputError` if a mesh would have more than `MOST_TETRAHEDRA` elements, before the mesh is made."""
+    """Raise `InputError`, before a mesh is made, if it would have more than `MOST_TETRAHEDRA` elements."""
     if tetrahedra > MOST_TETRAHEDRA:
         remedy = (
             "give fewer cells" if names == "cells" else "use larger cells, or give lengths in metres, or add the unit"

@@ -13,15 +13,15 @@ from liverjax.mesh.tetrahedra import TetMesh
 
 #: Edges of a triangle. Middle nodes are listed in this order.
 _EDGES = ((0, 1), (1, 2), (2, 0))
-#: The same edges of a triangle with vertices in increasing order, each from its lower to its higher vertex. This is the
-#: direction of the shape function of order 3 of the edge.
+#: The same edges. If the vertices of the triangle are in increasing order, each edge leads from its lower to its higher
+#: vertex. This is the direction of the shape function of order 3 on the edge.
 _THIRD = ((0, 1), (1, 2), (0, 2))
 
 
 def triangle_nodes(mesh: TetMesh, triangles: Indices) -> list[Indices]:
     """Return the node numbers (m,) of triangles (m, 3): their vertices and, in quadratic meshes, middles of edges.
 
-    For triangles (m, 4) of a mesh of order 3, the order-3 functions of the edges and of the face follow.
+    For triangles (m, 4) of a mesh of order 3, the numbers of the functions of order 3 on edges and face follow.
     """
     vertices = [triangles[:, a] for a in range(3)]
     if mesh.order == 1:
@@ -73,8 +73,8 @@ def pressure_forces(triangles: Indices, x: jax.Array, mesh: TetMesh | None = Non
         nodes, own = triangles.T, jnp.broadcast_to(-1 / 6 * twice, (3, *twice.shape))
     else:
         nodes = jnp.stack(triangle_nodes(mesh, triangles))
-        # The integrals are exact if the positions are quadratic functions. Their derivatives at the reference shape are
-        # also exact.
+        # The integrals are exact if the positions are quadratic functions. At the reference shape, the derivatives of
+        # the integrals with respect to the positions are also exact.
         weights, l = triangle_rule(4 if mesh.order == 2 else 5)
         N, along = (_quadratic if mesh.order == 2 else _ten_functions)(l)
         signs = None if mesh.order == 2 else _signs_of_functions(triangles, x.dtype)
@@ -86,10 +86,10 @@ def pressure_forces(triangles: Indices, x: jax.Array, mesh: TetMesh | None = Non
 
 
 def _signs_of_functions(triangles: Indices, dtype: DTypeLike) -> jax.Array:
-    """Return signs (10, m, 1) of the ten functions of triangles (m, 4), counter-clockwise about the normal.
+    """Return signs (10, m, 1) of the ten functions of triangles (m, 4) with outward normals.
 
-    A function of order 3 on an edge points to the vertex with the higher number. If the triangle goes along this edge
-    to the vertex with the lower number, the sign is -1.
+    A function of order 3 on an edge points to the vertex with the higher number. If the edge in `_THIRD` leads to the
+    vertex with the lower number, the sign is -1.
     """
     signs = jnp.ones((10, len(triangles), 1), dtype)
     for k, (a, b) in enumerate(_THIRD):
@@ -133,7 +133,7 @@ def _quadratic(l: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
 
 def _ten_functions(l: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return ten functions (10, Q) and their derivatives: the functions of `_quadratic`, then those of order 3 on the
-    edges and on the face. The arguments are the same as for `_quadratic`."""
+    edges and on the face. The argument and the form of the result are the same as for `_quadratic`."""
     N, slopes = _quadratic(l)
     zero = np.zeros_like(l[0])
     more, by = [], []

@@ -57,18 +57,21 @@ class Tied(Protocol):
         """Whether the positions of these nodes are a linear function of their unknowns."""
 
     def gathered(self, field: jax.Array, x: jax.Array | None = None) -> jax.Array:
-        """Project a nodal field (V, 3) onto the free motions of the nodes. For forces, x (V, 3) are the positions."""
+        """Project a nodal field (V, 3) onto the free motions of the nodes. Forces also need the positions x (V, 3)."""
 
     def at(self, x: jax.Array) -> "Tied":
         """Return the same nodes with the directions of their motions at positions x (V, 3)."""
 
     def turned(self, field: jax.Array, other: Self) -> jax.Array:
-        """Return `field` (V, 3), in which the motions of these nodes have the directions of `other`, the same nodes."""
+        """Return `field` (V, 3), in which the motions of these nodes have the directions of `other`.
+
+        `other` are the same nodes at other positions (method `at`). The amplitudes of the motions do not change.
+        """
 
     def unknown(self, field: jax.Array, x: jax.Array) -> jax.Array:
-        """Return `field` (V, 3), in which the rows of these nodes contain the unknowns of their motion to x (V, 3).
+        """Return `field` (V, 3), in which the rows of these nodes contain their unknowns for the positions x (V, 3).
 
-        x are positions. The method `placed` is the inverse of this method.
+        The method `placed` is the inverse of this method.
         """
 
     def placed(self, field: jax.Array, s: Number) -> jax.Array:
@@ -153,14 +156,14 @@ class End(NamedTuple):
     x: jax.Array  # (V, 3) [m] positions
     F: Matrix  # deformation gradients (E,), or (Q, E) with Q integration points per element
     pressure: Any  # (V,) [Pa] at the nodes, or None
-    by_end_forces: jax.Array | None = None  # (V, 3) [m/s^2] minus the acceleration due to force terms with `at_end`
+    by_end_forces: jax.Array | None = None  # (V, 3) [m/s^2] acceleration due to terms with `at_end`, times -1
 
 
 class Solid:
     """A force term of one step. Its stress in an element depends only on the deformation gradient."""
 
     def stress(self, F: Matrix) -> Matrix:
-        """First Piola-Kirchhoff stress [Pa]."""
+        """Return the first Piola-Kirchhoff stress [Pa]."""
         raise TypeError(f"{type(self).__name__} must define stress(F)")
 
     def blocks(self, F: Matrix, D: list[Vector], pairs: Pairs) -> list[Matrix]:
@@ -171,7 +174,7 @@ class Solid:
         raise TypeError(f"{type(self).__name__} must define blocks(F, D, pairs)")
 
     def energy(self, F: Matrix) -> jax.Array:
-        """Energy density (E,) [Pa]."""
+        """Return the energy density (E,) [Pa]."""
         raise TypeError(f"{type(self).__name__} must define energy(F)")
 
     def parts(self) -> tuple[list[tuple[Any, Any]], Matrix | None]:
@@ -200,7 +203,7 @@ class VolumeStress:
         raise TypeError(f"{type(self).__name__} must define pressure(mesh, J)")
 
     def stress(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Matrix:
-        """First Piola-Kirchhoff stress [Pa] at given pressures (V,)."""
+        """Return the first Piola-Kirchhoff stress [Pa] at given pressures (V,)."""
         raise TypeError(f"{type(self).__name__} must define stress(mesh, pressure, F)")
 
     def scalars(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Scalars:
@@ -234,11 +237,11 @@ class NodalForce:
     at_end: bool = False
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Nodal forces (V, 3) [N], the gradient of the energy, at positions x (V, 3) and fraction s of a step."""
+        """Return the gradient of the energy (V, 3) [N]: nodal forces at positions x (V, 3) and fraction s of a step."""
         raise TypeError(f"{type(self).__name__} must define force(mesh, x, s)")
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
-        """Energy [J] at the end of the step."""
+        """Return the energy [J] at the end of the step."""
         raise TypeError(f"{type(self).__name__} must define energy(mesh, x)")
 
     def energy_from(self, mesh: TetMesh, x: jax.Array, start: jax.Array) -> jax.Array:

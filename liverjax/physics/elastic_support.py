@@ -71,7 +71,7 @@ class ElasticSupport(Physics):
         return cls(triangles=jnp.asarray(triangles, jnp.int32), **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Raise InputError for wrong or missing node numbers, or a history whose shape does not match its times."""
+        """Raise InputError for wrong or missing node numbers, wrong stiffnesses, or a wrong history."""
         history.check_times(self.times, self.history, name)
         if (self.triangles is None) == (self.nodes is None):
             raise InputError(f"{name} needs either triangles or nodes: give one of them")
@@ -113,7 +113,7 @@ class ElasticSupport(Physics):
         return replace(self, triangles=promotion.with_faces(mesh, self.triangles))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Return nodes (n,), each with a principal axis (n, 3) along which its springs have a stiffness."""
+        """Return nodes (n,) and directions (n, 3): the principal axes along which the springs of a node are stiff."""
         K = np.moveaxis(np.array([[np.asarray(e) for e in row] for row in blocks(self, mesh)]), -1, 0)
         size, axes = np.linalg.eigh(K)
         node, axis = np.nonzero(size > 1e-9 * max(size.max(), 1e-300))

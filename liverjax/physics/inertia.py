@@ -1,4 +1,4 @@
-"""Inertia of lumped or consistent masses, with implicit Euler or Newmark's average acceleration.
+"""Inertia of lumped or consistent masses, with implicit Euler or Newmark's method (average acceleration).
 
 Newmark's method uses the mean of the forces at both ends of a step. The forces of an obstacle with a given position are
 an exception: only their value at the end of the step is used (Kane et al. 1999, Comput. Methods Appl. Mech. Eng. 180,

@@ -134,7 +134,8 @@ def check_inlets(porosity: Porosity) -> None:
     """Check that every inlet is complete. Values are not checked.
 
     Raises:
-        InputError: pressure and flux, nodes and triangles, or times and history do not belong together.
+        InputError: an inlet does not have exactly one of two pairs (pressure and nodes, or flux and triangles), or its
+            times and history do not match.
     """
     for k, inlet in enumerate(porosity.inlet):
         name = f"porosity.inlet.{k}"
@@ -333,7 +334,7 @@ class CoupledSponge(Sponge):
         return self.flow.matrix
 
     def energy(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
-        """Return the energy [J] of the porous body and of the fluid that leaves it."""
+        """Return the energy [J] of the porous body plus that of its fluid (function `fluid_energy`)."""
         density = volumetric_energy(self.porosity, J)
         return jnp.sum(mesh.weights * density) + fluid_energy(self.porosity, mesh, self.fluid, self.flow, J)
 

@@ -90,8 +90,9 @@ def prescribed(mesh: TetMesh, displaced: tuple, time: Number, fraction: Number) 
 def given_acceleration(place: Callable[[Number], jax.Array], k: Number, steps: int, dt: Number) -> jax.Array:
     """Return the acceleration (V, 3) [m/s^2] of a given motion at the end of step k, with an error of order dt^2.
 
-    It is the central difference of the positions. At the last step, where the next position is unknown, it is
-    extrapolated. For k = 0, the motion begins at rest, and a velocity that jumps there has its full impulse.
+    It is the central second difference of the positions. At the last step, where the next position is unknown, it is
+    extrapolated. For k = 0, the motion begins at rest. If the velocity jumps to v at the beginning, the result is 2
+    v/dt, so that Newmark's method applies the whole impulse in the first step.
 
     Args:
         place: function k -> positions (V, 3) [m] after k steps.
@@ -102,7 +103,7 @@ def given_acceleration(place: Callable[[Number], jax.Array], k: Number, steps: i
     n = jnp.where(k == steps, k - 1, k)
     x = [place(jnp.maximum(n + i, 0)) for i in (1, 0, -1, -2)]
     now, before = x[0] - 2 * x[1] + x[2], x[1] - 2 * x[2] + x[3]
-    # Before step 2, the second difference contains the jump of the velocity at the beginning.
+    # For n = 1, `before` contains the jump of the velocity at the beginning, so it is not used.
     change = jnp.where(n > 1, now - before, 0.0) if steps > 2 else jnp.zeros_like(now)
     begin = jnp.where(k == 0, 2.0, 1.0)
     return (begin * now + (k - n) * change) / dt**2

@@ -94,7 +94,7 @@ class RigidPlate(Physics):
         return replace(self, nodes=nodes) if mesh.order < 3 else replace(self, still=nodes[len(self.nodes) :])
 
     def constrain(self, free: Free) -> Free:
-        """Set the unknowns of the cubic shape functions on the plate to 0 (remove them from the free directions)."""
+        """Remove the unknowns of the cubic shape functions on the plate from the free directions. They stay 0."""
         return free if self.still is None else free._replace(mask=free.mask.at[self.still].set(0.0))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
@@ -216,7 +216,7 @@ class Plate(NamedTuple):
         return self._replace(carrier=x[self.plate.nodes])
 
     def turned(self, field: jax.Array, other: "Plate") -> jax.Array:
-        """Return `field` (V, 3), in which the plate's motions have the directions of `other`, the same plate."""
+        """Return `field` (V, 3), in which the plate's motions have the directions of `other` (same plate, moved)."""
         return other.spread(field, *self.amplitudes(field, self._arms(self.carrier)))
 
     def given(self, s: Number) -> jax.Array:

@@ -49,7 +49,7 @@ class SlidingSupport(Physics):
             )
 
     def constrain(self, free: Free) -> Free:
-        """Return the free directions without the normal of the plane at the nodes."""
+        """Return the free directions, after the normal of the plane is removed from the directions of the nodes."""
         if self.axis:
             return free._replace(mask=free.mask.at[self.nodes, selection.AXES.index(self.axis)].set(0.0))
         normals = jnp.zeros_like(free.mask) if free.normals is None else free.normals

@@ -3,8 +3,8 @@
 S_v is the second Piola-Kirchhoff stress of the viscoelastic body, and S_h is the stress of the law. Each mode k has one
 internal (history) variable, the symmetric tensor gamma_k. It is the part of the stress that has relaxed in this mode.
 The history variables are updated from step n-1 to step n by a recursion: gamma^n = a S^n + c S^(n-1) + b gamma^(n-1). S
-is the stress that relaxes (S_h or its isochoric part), dt the time step, and g and tau are ratio and relaxation time of
-the mode. There are two schemes:
+is the stress that relaxes (S_h or its isochoric part), dt is the time step, and g and tau are the ratio and the
+relaxation time of the mode. There are two schemes:
 
 * ``"exponential"``: exact if the stress changes linearly during the step. e = exp(-dt/tau), q = (1 - e) tau/dt,
   a = g (1 - q), c = g (q - e), b = e. This scheme is of second order in dt.
@@ -50,7 +50,7 @@ PARTS = ("all", "isochoric")
 class Prony:
     """Prony series alpha(t) = 1 - sum_k g_k (1 - exp(-t/tau_k)): stress at time t, divided by the initial stress.
 
-    The series has N modes k. After a long time, the fraction 1 - sum_k g_k of the stress remains.
+    The series has N modes k. At constant strain, the fraction 1 - sum_k g_k of the stress remains after a long time.
     """
 
     ratios: Any = param("1", "g_k, fraction that relaxes in mode k (N,), or per element (N, E)", lower=0.0, upper=1.0)
@@ -148,7 +148,7 @@ def check_series(prony: Prony) -> None:
 def coefficients(prony: Prony, dt: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return the coefficients a, b, c of the recursion gamma^n = a S^n + c S^(n-1) + b gamma^(n-1), for dt [s].
 
-    Each has the shape of the ratios: (N,) for N modes, or (N, E).
+    Each coefficient has the shape of the ratios: (N,) for N modes, or (N, E).
     """
     g, tau = jnp.asarray(prony.ratios), jnp.asarray(prony.relaxation_times)
     r = dt / tau
@@ -169,7 +169,7 @@ def lasting(prony: Prony, order: int = 1) -> jax.Array:
 
 
 def _beside(numbers: jax.Array, ndim: int) -> jax.Array:
-    """Add axes to `numbers`, (N,) or (N, E) for N modes, to broadcast with arrays (N, 6, …, E) of `ndim` dimensions."""
+    """Add axes to `numbers` (N,) or (N, E), so that they broadcast with arrays (N, 6, …, E) of `ndim` dimensions."""
     if numbers.ndim == 1:
         return numbers[(slice(None), *(None,) * (ndim - 1))]
     return numbers[(slice(None), *(None,) * (ndim - 2))]
@@ -178,9 +178,9 @@ def _beside(numbers: jax.Array, ndim: int) -> jax.Array:
 def _weights(r: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return 1 - q and q - e of the exponential scheme (docstring of the module) for r = dt/tau, without cancellation.
 
-    Below r = 1, the Taylor series of 1 - q is used (truncated at 1/20!).
+    Below r = 1, the truncated Taylor series of 1 - q is used. Its error is below 1/20!.
     """
-    # `minimum` and `maximum` would give half of the derivative at r = 1 (time step equal to a relaxation time).
+    # At r = 1 (time step equal to a relaxation time), `minimum` and `maximum` would give half of the derivative.
     small, large = jnp.where(r < 1, r, 1.0), jnp.where(r < 1, 1.0, r)
     series = jnp.zeros_like(r)
     for k in range(18, 0, -1):
@@ -193,7 +193,7 @@ def _weights(r: jax.Array) -> tuple[jax.Array, jax.Array]:
 def complex_ratios(prony: Prony, omega: Number, dt: Number | None = None) -> jax.Array:
     """Return the complex ratios gamma_k / S_h (N, ...) of N modes in steady vibration.
 
-    Ratios and times of `prony` must be (N,). If they differ between elements, call this function for each element.
+    Ratios and times must have the shape (N,). If they differ between elements, call this function for each element.
 
     gamma_k is the stress that has relaxed in mode k, and S_h the stress of the law. `omega` [rad/s] are angular
     frequencies. With `dt` [s] the ratios are exact for the time-discrete recursion. Without `dt` they are the ratios in

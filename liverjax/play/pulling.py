@@ -84,7 +84,7 @@ def at_rest(scene: Scene) -> Playing:
 
 def _with_histories(scene: Scene) -> Scene:
     """Return the scene with a history for prescribed motions and forces that grow until the last step. With this
-    history, these motions and forces grow in the planned time of the scene, and are constant afterwards."""
+    history, these motions and forces grow during the planned time of the scene, and are constant afterwards."""
     if scene.solve.dt is None:
         return scene
     table = {"times": scene.solve.steps * scene.solve.dt * jnp.array([0.0, 1.0]), "history": jnp.array([0.0, 1.0])}

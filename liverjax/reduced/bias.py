@@ -25,8 +25,8 @@ def reduced_bias(
 ) -> dict[str, np.ndarray]:
     """Return the bias of identified parameters, in the units and shapes of the parameters.
 
-    Subtract the bias from the identified parameters to correct them. The function does one full run. It cannot be used
-    inside jit, grad or vmap.
+    Subtract the bias from the identified parameters to correct them. The function runs the full model once. It cannot
+    be used inside jit, grad or vmap.
 
     Args:
         model, scene: the same arguments as for `simulate_reduced`.

@@ -3,10 +3,11 @@ training runs.
 
 The reduced model is run with the parameter sets of its training, for which full runs exist. The difference between the
 full and the reduced motion is approximated by a sum of fields. The coefficient of each field is a polynomial of the
-reduced coordinates: linear in all coordinates, and quadratic in the first few coordinates. In scenes with time, the
-time derivatives of the coordinates are also terms of the polynomial. The factors of the terms are found by least
-squares with a small ridge penalty (closures of reduced models: Ahmed, Pawar, San, Rasheed, Iliescu, Noack 2021, Phys.
-Fluids 33, 091301). The differences of each run are divided by the largest displacement of this run.
+reduced coordinates: linear in all coordinates, and quadratic in the first few coordinates. In scenes with time, it also
+has terms with the time derivatives of the coordinates, and with products of coordinates and time derivatives. The
+factors of the terms are found by least squares with a small ridge penalty (closures of reduced models: Ahmed, Pawar,
+San, Rasheed, Iliescu, Noack 2021, Phys. Fluids 33, 091301). The differences between full and reduced motion in each run
+are divided by the largest displacement of this run.
 
 In a cross-validation, the fit is repeated without one group of runs, for each group. The errors of the left-out runs
 determine how many coordinates have quadratic terms. These errors also give a model of the error of the corrected motion
@@ -27,13 +28,13 @@ from liverjax.tensors.principal_fields import principal_fields
 
 #: GROUPS: number of groups of runs in the cross-validation. FEWEST_RUNS: minimum number of runs for a correction.
 GROUPS, FEWEST_RUNS = 12, 6
-#: PRODUCTS: the numbers of coordinates with quadratic terms that are tried. RATES: maximum number of coordinates that
-#: are multiplied by time derivatives.
+#: PRODUCTS: values that are tried for the number of coordinates with quadratic terms. RATES: maximum number of
+#: coordinates that are multiplied by time derivatives.
 PRODUCTS, RATES = (0, 6, 12, 20), 8
-#: RIDGE: ridge penalty, relative to the mean squares of the terms. OUTSIDE: fraction of the differences of full and
-#: reduced motion that the fields may neglect. MOST_FIELDS: maximum number of fields.
+#: RIDGE: ridge penalty, relative to the mean squares of the terms. OUTSIDE: fraction of the differences between full
+#: and reduced motion that the fields may neglect. MOST_FIELDS: maximum number of fields.
 RIDGE, OUTSIDE, MOST_FIELDS = 1e-6, 0.02, 150
-#: Maximum number of training states whose differences of full and reduced motion are used to compute the fields.
+#: The fields are computed from evenly spaced training states. Their number is less than twice this value.
 FIELD_STATES = 1500
 #: Prior values of the three exponents of the stated error. With few runs, the exponents stay close to these values.
 #: With the prior values, the stated error of the motion is a constant times the square root of the leverage.
@@ -68,7 +69,9 @@ class Learnt(NamedTuple):
 
 
 def terms(q: jax.Array, scale: Number, products: int, dt: Number | None) -> jax.Array:
-    """Return the values (T, k) [1] of the k terms of the polynomial at every step of a run that begins at rest.
+    """Return the values (T, k) of the k terms of the polynomial at every step of a run that begins at rest.
+
+    The unit is 1, or 1/s for terms with a time derivative.
 
     Args:
         q: the n reduced coordinates at T steps (T, n) [m^2.5].
@@ -93,13 +96,13 @@ def correction_at(own: Correction, q: jax.Array, dt: Number | None) -> jax.Array
 
 
 def size_at(own: Correction, q: jax.Array, dt: Number | None) -> jax.Array:
-    """Return the maximum correction (T,) [m] of a node position up to each of T steps."""
+    """Return the largest correction (T,) [m] of a node position, over all steps up to each of T steps."""
     return jax.lax.cummax(_largest_of_steps(correction_at(own, q, dt)))
 
 
 def stated_at(own: Correction, q: jax.Array, moved: jax.Array, dt: Number | None) -> jax.Array:
-    """Return the stated error (T,) [m] of the corrected motion: the maximum distance of a node from its position in the
-    full model, up to each step.
+    """Return the stated error (T,) [m] of the corrected motion: an estimate of the maximum distance of a node from its
+    position in the full model. The value for a step is the maximum over all steps up to this step.
 
     Args:
         own: `Correction`.
@@ -140,7 +143,7 @@ def _logarithms(corrected: jax.Array, moved: jax.Array, leverage: jax.Array) -> 
 
 
 class _LeftOut(NamedTuple):
-    """Maxima over the steps of each of R runs (R,), with a correction that was learnt without the group of this run."""
+    """Maxima (R,) over the steps of each of R runs. The correction of a run is learnt without the group of the run."""
 
     off: np.ndarray  # maximum error [m]
     corrected: np.ndarray  # maximum correction [m]
@@ -188,7 +191,8 @@ def learnt_correction(runs: Learnt) -> Correction | None:
 def _left_out(
     A: np.ndarray, sums: "_LeastSquares", group: np.ndarray, missing: np.ndarray, fields: np.ndarray
 ) -> _LeftOut:
-    """Return the errors of every run, with a correction learnt without the group of this run.
+    """Return error, correction and leverage of every run, with the correction that was learnt without the group of this
+    run.
 
     Args:
         A: values of the k terms of the polynomial in R runs (R, T, k).
@@ -212,8 +216,8 @@ def _statement(out: _LeftOut, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray
     (R,) for the R left-out runs.
 
     The exponents come from a least-squares fit of the logarithms. With few runs they stay close to
-    `FEW_RUNS_EXPONENTS`. The constant is chosen so that the logarithms of the 1 % and 99 % quantiles of this ratio have
-    the same absolute value.
+    `FEW_RUNS_EXPONENTS`. The constant is chosen so that the logarithms of the 1 % and 99 % quantiles of the ratio
+    between stated and true error have the same absolute value.
     """
     x = np.asarray(_logarithms(*(jnp.asarray(a) for a in (out.corrected, moved, out.leverage))))
     y = np.log(np.maximum(out.off / moved, np.finfo(float).tiny)) - x @ FEW_RUNS_EXPONENTS
@@ -231,8 +235,8 @@ def _farthest(u: np.ndarray) -> np.ndarray:
 
 
 def _error_fields(weighted: np.ndarray) -> np.ndarray:
-    """Return m orthonormal fields (m, 3 V) that approximate N differences `weighted` (N, 3 V) of full and reduced
-    motion. Fields and differences are multiplied by the square roots of the nodal volumes."""
+    """Return m orthonormal fields (m, 3 V) that approximate N differences `weighted` (N, 3 V) between full and
+    reduced motion. Fields and differences are multiplied by the square roots of the nodal volumes."""
     return principal_fields(weighted[:: max(1, len(weighted) // FIELD_STATES)], OUTSIDE)[:MOST_FIELDS]
 
 

@@ -10,9 +10,10 @@ with the mass matrix M, the acceleration a(e), the stiffness K of the reference 
 history variables. These variables are updated from step to step as in the full model. The matrix of the left-hand side
 is factorised once per run. So a step needs the forces of the full mesh and one linear solve, but no Newton iterations.
 In statics the energy norm of e is the dual norm of r. The estimate neglects terms of second order in e. Near buckling,
-the deformed body is much softer than the reference shape, and K then gives a much too small error. So in statics
-without a fluid, one more equation is solved with the stiffness of the deformed body, at the step with the largest
-error. If its solution is larger by more than the factor `SOFTER`, all errors are multiplied by this ratio.
+the deformed body is much softer than the reference shape, and K then gives an error that is much too small. So in
+statics without a fluid, the response to the forces r at the step with the largest error is computed with the stiffness
+of the deformed body, and with that of the reference shape. If the first response is more than `SOFTER` times as large,
+all errors are multiplied by the ratio of the two responses.
 
 In a scene with a porous body, the fluid pressures on the full mesh are computed from the reduced motion. Then the
 volume balance of the fluid is fulfilled, and only the forces are out of balance. These forces cause the errors of
@@ -56,15 +57,15 @@ if TYPE_CHECKING:
     import scipy.sparse
 
 
-#: See the docstring of the module.
+#: The errors are multiplied by the result of `_softening` only if this result is above this value (module docstring).
 SOFTER = 2.0
 
 
 class _Body(NamedTuple):
     """Matrices (f, f) of the linear equations for the error, where f is the number of free degrees of freedom."""
 
-    relaxing: jax.Array  # stiffness of the part that relaxes [N/m]
-    rest: Any  # stiffness of the part that does not relax; None if there is no such part
+    relaxing: jax.Array  # stiffness of the stress that relaxes [N/m]; without viscosity: of the whole stress
+    rest: Any  # stiffness of springs and of the stress that does not relax [N/m]; None if there are no such parts
     mass: Any  # diagonal of the mass matrix (f,) [kg]; None without inertia
 
 
@@ -93,9 +94,9 @@ def reduced_error(model: ReducedModel, scene: Scene, result: ReducedResult) -> R
 
 
 def _softening(scene: Scene, r: np.ndarray, x: jax.Array) -> float:
-    """Return how much larger the response to forces r (V, 3) [N] is with the stiffness at positions x (V, 3) [m] than
-    with the stiffness of the reference shape: ratio of the largest displacements of a node. Viscosity is not used. The
-    ratio is infinite if the stiffness at x is singular or not finite."""
+    """Return the largest nodal displacement due to forces r (V, 3) [N] with the stiffness at positions x (V, 3) [m],
+    divided by the largest nodal displacement with the stiffness of the reference shape. Viscosity is not used. The
+    ratio is infinite if one of the two stiffness matrices is singular or not finite."""
     from scipy.sparse.linalg import splu
 
     free = np.flatnonzero(np.asarray(free_directions(scene).mask).ravel())

@@ -63,8 +63,8 @@ class PressureModes:
 
 @struct
 class ReducedModel:
-    """A reduced model of one scene with n modes and S points. The loads of the scene and the parameters of its law and
-    viscosity can be changed."""
+    """A reduced model of one scene with n modes and S points. The loads of the scene and the parameters of law,
+    viscosity, porosity, supports and body can be changed."""
 
     modes: jax.Array = param("m^-1.5", "(n, V, 3), orthonormal with the nodal volumes as weights")
     slopes: jax.Array = param("m^-2.5", "gradients of the modes at the points (9, S, n), with 9 entries row by row")
@@ -228,8 +228,8 @@ def refuse_another_scene(model: ReducedModel, scene: Scene) -> None:
 
 
 def other_numbers(scene: Scene, varied: Mapping[str, np.ndarray | jax.Array]) -> str:
-    """Return a JSON string: names and digests of the numbers of a scene that are the same in all training runs, and the
-    settings of time integration.
+    """Return a JSON string: names and digests of the numbers of a scene, the time integrator and the duration of the
+    run. The numbers in `varied` count as 0, because they differ between the training runs.
 
     Args:
         scene: `Scene` with known numbers (not inside jit, grad or vmap).

@@ -227,7 +227,7 @@ def simulate_reduced(model: ReducedModel, scene: Scene) -> ReducedResult:
     Args:
         model: `ReducedModel`, from `reduce_scene` or `load_reduced`.
         scene: the scene for which the model was made. Its loads, its time step, and the parameters of law, regions,
-            viscosity and body may be changed.
+            viscosity, porosity, supports and body may be changed.
 
     Raises:
         InputError: the model was made for another scene, or the scene has numbers that `simulate` does not allow.
@@ -273,7 +273,8 @@ def _free_motion(model: ReducedModel, scene: Scene, result: ReducedResult) -> ja
 
 
 def stated_error(model: ReducedModel, scene: Scene, result: ReducedResult, corrected: bool = True) -> jax.Array:
-    """Estimate the maximum distance (T,) [m] of a node from its position in the full model, up to each step.
+    """Estimate the maximum distance (T,) [m] of a node from its position in the full model. The value for a step is the
+    maximum over all steps up to this step.
 
     Unlike `reduced_error`, this function does not solve equations on the full mesh, and it may be used inside jit, grad
     and vmap. The error of the corrected motion is learnt from training runs, by cross-validation. The uncorrected

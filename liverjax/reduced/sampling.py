@@ -3,7 +3,7 @@
 The contributions of all P integration points to the reduced forces form a matrix G. It has one row for each reduced
 force in each training state, and the sum of a row is this force. The rows of G are replaced by the most important
 singular vectors of G. Then the factors xi >= 0 of the points are the least-squares solution of G xi = G 1, where 1 is
-the vector of ones (method of Lawson and Hanson). One more equation keeps the total volume. The number of positive
+the vector of ones (method of Lawson and Hanson). One more equation preserves the total volume. The number of positive
 factors is at most the number of equations (Hernandez, Caicedo, Ferrer 2017).
 """
 
@@ -52,7 +52,7 @@ class Coordinates(NamedTuple):
 def sampled(
     whole: ReducedModel, scene: Scene, values: Mapping[str, Any], runs: Coordinates, tolerance: float
 ) -> ReducedModel:
-    """Select few points from a model with all points, using the coordinates of R training runs. Return the model with
+    """Select a few points from a model with all points, using the coordinates of R training runs. Return the model with
     these points.
 
     States at rest are not used. States with an inverted element are not used if the law has no finite stress there.
@@ -84,11 +84,11 @@ def sampled(
 
 
 def _balances(volumes: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Return rows (2 K m, P) of the matrix G, from both sides `volumes` (2, K, m, P) [Pa] of the fluid's volume balance
-    (see `_balance`), for K states, m pressure modes and P points.
+    """Return rows (2 K m, P) of the matrix G, from both sides `volumes` (2, K, m, P) [Pa m^1.5] of the fluid's volume
+    balance (see `_balance`), for K states, m pressure modes and P points.
 
     Each row is divided by the scale of its state. The scale is the norm of the pressures due to the change of volume,
-    plus the norm of the pressure coordinates p (K, m) [Pa].
+    plus the norm of the pressure coordinates p (K, m) [Pa m^1.5].
     """
     size = np.linalg.norm(volumes[0].sum(axis=2), axis=1) + np.linalg.norm(p, axis=1)
     return (volumes / np.where(size > 0, size, 1.0)[:, None, None]).reshape(-1, volumes.shape[-1])
@@ -105,7 +105,7 @@ def _at(whole: ReducedModel, points: np.ndarray, weights: jax.Array) -> ReducedM
 
 
 def states_of(runs: int, steps: int) -> list[tuple[int, np.ndarray]]:
-    """Return (number of a run, numbers of its steps) for all training states whose forces are used.
+    """Return a list of (number of a run, numbers of its steps). The forces of these training states are used.
 
     The chosen steps of a run are evenly spaced, and the first chosen step differs from run to run. So all times occur,
     even if only few steps of each run are used. The first steps of the runs alone would contain no large motion.
@@ -119,8 +119,8 @@ def states_of(runs: int, steps: int) -> list[tuple[int, np.ndarray]]:
 
 
 def _reduced_compliance(whole: ReducedModel, scene: Scene) -> np.ndarray:
-    """Return the reduced compliance (n, n) [m/N] of n modes: the inverse of the reduced stiffness at the reference
-    shape."""
+    """Return the reduced compliance (n, n) [m^4/N] of n modes: the inverse of the reduced stiffness at the reference
+    shape. The changes of the law in regions are not used."""
     modes = np.asarray(whole.modes).reshape(whole.number_of_modes, -1)
     K = mjed.stiffness_matrix(scene.mesh, law_at_rest(scene), scene.mesh.points)
     springs = reduced_springs(whole.modes, scene)
@@ -131,8 +131,8 @@ def _reduced_compliance(whole: ReducedModel, scene: Scene) -> np.ndarray:
 def _contributions(
     whole: ReducedModel, scene: Scene, run: tuple[jax.Array, jax.Array | None], times: jax.Array
 ) -> tuple[jax.Array, jax.Array | None]:
-    """Return (forces, balance). forces (K, n, P) [N] are the contributions of the P points to the n reduced forces at
-    the K steps `times` of a run. balance is the result of `_balance`, or None if the scene has no fluid.
+    """Return (forces, balance). forces (K, n, P) [N m^-1.5] are the contributions of the P points to the n reduced
+    forces at the K steps `times` of a run. balance is the result of `_balance`, or None if the scene has no fluid.
 
     `run` contains the coordinates of the modes of motion (T, n) [m^2.5] and of the m modes of pressure (T, m)
     [Pa m^1.5].
@@ -163,8 +163,8 @@ def _contributions(
 def _balance(
     whole: ReducedModel, scene: Scene, gradient: Callable[[jax.Array], jax.Array], p: jax.Array, times: jax.Array
 ) -> jax.Array:
-    """Return the contributions of the P points to both sides of the fluid's volume balance at K steps, as pressures
-    (2, K, m, P) [Pa] in m modes.
+    """Return the contributions of the P points to both sides of the fluid's volume balance at K steps, as coordinates
+    (2, K, m, P) [Pa m^1.5] of m pressure modes.
 
     The first side is the change of volume in a step. The second side is the fluid that is stored or flows away.
 
@@ -194,8 +194,8 @@ def _balance(
 
 
 def nonnegative_weights(G: np.ndarray, volumes: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return non-negative factors xi (P,) of the points, with G xi close to G 1 (symbols: module docstring). Few
-    factors are above 0, and the total volume is nearly unchanged.
+    """Return non-negative factors xi (P,) of the points, with G xi close to G 1 (symbols: module docstring). Only a
+    few factors are above 0, and the total volume is nearly unchanged.
 
     Args:
         G: contributions of the P points to each reduced force in each state (rows, P).

@@ -182,9 +182,9 @@ def _displacements(scene: Scene, names: tuple[str, ...], rows: np.ndarray) -> np
 def _terms(
     known: np.ndarray, shape: tuple[int, ...], tolerance: float, most: int
 ) -> tuple[np.ndarray, list[np.ndarray], float]:
-    """Return (products, factors, left). products (N, M): product of the functions in each term at the grid; factors:
-    values (M, points) of these functions for each parameter; left: fraction of the displacements that the terms do not
-    describe.
+    """Return (products, factors, left). products (N, M): product of the functions of each term, at the N grid points;
+    factors: values (M, points) of these functions for each parameter; left: fraction of the displacements that
+    the terms do not describe.
 
     Args:
         known: displacements at the grid (N, 3 V), times the square roots of the nodal volumes.

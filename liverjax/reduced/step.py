@@ -36,9 +36,9 @@ _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 class ReducedMotion(NamedTuple):
     """Velocity and acceleration of the n reduced coordinates, and the last change of the acceleration."""
 
-    velocity: jax.Array  # (n,) [m/s]
-    acceleration: jax.Array  # (n,) [m/s^2]
-    change: jax.Array  # change of the acceleration in the last step (n,) [m/s^2]
+    velocity: jax.Array  # (n,) [m^2.5/s]
+    acceleration: jax.Array  # (n,) [m^2.5/s^2]
+    change: jax.Array  # change of the acceleration in the last step (n,) [m^2.5/s^2]
     steady: jax.Array  # whether `change` is closer to the change in the step before than to 0
 
 
@@ -54,17 +54,17 @@ class ReducedEquations(NamedTuple):
     motion: ReducedMotion | None
     dt: jax.Array
     newmark: bool | None
-    spread: jax.Array | None  # absolute values of the mode gradients (9, S, n) [1/m] if motion is prescribed
-    noise: jax.Array  # roundoff of the forces, divided by the tolerance [N]; it is added to the scale of residuals
+    spread: jax.Array | None  # absolute values of the mode gradients (9, S, n) [m^-2.5]; None without prescribed motion
+    noise: jax.Array  # roundoff of the forces, divided by the tolerance [N m^-1.5]; added to the scale of residuals
     fluid: Flowing | None  # data of the fluid; None if the scene has no porous body
     light: SinglePrecision  # mode gradients in single precision
-    steepest: jax.Array  # square root of the sum of squares of all mode gradients [1/m]
-    springs: jax.Array | None = None  # stiffness of elastic supports (n, n) [N/m]
+    steepest: jax.Array  # square root of the sum of squares of all mode gradients [m^-2.5]
+    springs: jax.Array | None = None  # stiffness of elastic supports (n, n) [N m^-4]
 
 
 def reduced_kinematics(e: ReducedEquations, q: jax.Array) -> ReducedMotion:
     """Return velocity and acceleration at the end of the step, for the n reduced coordinates q (n,) [m^2.5] at this
-    time. The formulas are those of `liverjax.physics.inertia.Moving.kinematics`."""
+    time. `liverjax.physics.inertia.Moving.kinematics` has the same formulas."""
     assert e.motion is not None
     velocity = (q - e.q) / e.dt
     acceleration = (velocity - e.motion.velocity) / e.dt
@@ -87,7 +87,8 @@ def _stresses(solid: Solid, F: jax.Array) -> jax.Array:
 
 
 def reduced_noise(model: ReducedModel, scene: Scene) -> jax.Array:
-    """Return the roundoff of the reduced forces due to a unit stretch along x, divided by the tolerance [N].
+    """Return the roundoff of the reduced forces due to a unit stretch along x, divided by the tolerance
+    [N m^-1.5].
 
     This force is added to the scale of the residuals, so that the scale is not 0 if there are no loads (see
     `liverjax.simulation.equations.Equations.noise`).
@@ -195,7 +196,7 @@ class _ReducedIterate(NamedTuple):
     tangents: jax.Array  # number of computed tangents
 
 
-#: If the residual after an iteration is more than this fraction of the residual before, a new tangent is computed. A
+#: If the residual after an iteration is more than this fraction of the residual before it, a new tangent is computed. A
 #: tangent needs as much time as ten iterations.
 _LITTLE_GAIN = 0.95
 #: If the error due to single precision exceeds this fraction of the tolerance, the forces are computed again in double
@@ -204,8 +205,8 @@ _DOUBT = 0.1
 
 
 def _updated(inverse: jax.Array, moved: jax.Array, change: jax.Array) -> jax.Array:
-    """Return the updated inverse tangent (n, n) [m/N]. `change` (n,) [N] is the change of the forces on the n modes due
-    to the motion `moved` (n,) [m].
+    """Return the updated inverse tangent (n, n) [m^4/N]. `change` (n,) [N m^-1.5] is the change of the forces on the n
+    modes due to the motion `moved` (n,) [m^2.5].
 
     This is the update of Broyden, Fletcher, Goldfarb and Shanno (1970), which keeps the inverse symmetric and positive
     definite. If the forces decrease along the motion, no positive definite inverse is possible, and the old inverse is
@@ -273,14 +274,14 @@ def _corrected(e: ReducedEquations, at: _ReducedIterate) -> _ReducedIterate:
 def step_end(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, inverse: jax.Array) -> _Found:
     """Return the reduced coordinates at the end of a step, with residual, number of iterations and inverse tangent.
 
-    Derivatives of this function are those of the exact solution, not those of the iterations.
+    The derivatives of this function are the derivatives of the exact solution, not of the iterations.
 
     Args:
         newmark: whether the time integrator is Newmark's method.
         most: maximum number of tangents that are computed.
         e: constants of the step.
         tolerance: maximum relative residual.
-        inverse: inverse tangent of the previous step for n modes (n, n) [m/N]; zeros in the first step.
+        inverse: inverse tangent of the previous step for n modes (n, n) [m^4/N]; zeros in the first step.
     """
     arrays, tree = jax.tree.flatten((e, tolerance, inverse))
 
@@ -316,9 +317,9 @@ def _solved(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, in
 
     start = e.q if e.motion is None else e.q + e.dt * e.motion.velocity
     if e.motion is not None and not newmark:
-        # The coordinates are predicted by a parabola or a cubic through the last coordinates. The one that would have
-        # predicted the last step better is used. Newmark's accelerations oscillate, so this prediction is not made
-        # with them.
+        # The coordinates are predicted by a parabola or a cubic through the last coordinates: by the curve that would
+        # have predicted the last step better. The accelerations of Newmark's method oscillate, so there the prediction
+        # uses only the velocity.
         more = jnp.where(e.motion.steady, e.motion.change, 0.0)
         start = start + e.dt**2 * (e.motion.acceleration + more)
     foretold, none = gradients_at(e, start), jnp.zeros((), jnp.int32)

@@ -24,20 +24,20 @@ class SinglePrecision(NamedTuple):
     """Gradients of the n modes at the S points in single precision, in two array layouts. Matrix products are a third
     faster if no matrix has to be transposed."""
 
-    slopes: jax.Array  # gradients (9, S, n) [1/m]
+    slopes: jax.Array  # gradients (9, S, n) [m^-2.5]
     flat: jax.Array  # the same gradients as a matrix (n, 9 S)
 
 
 class ReducedTangent(NamedTuple):
-    """The arrays B, A and R of the tangent (n, n) [N/m] (module docstring), for n modes and S points."""
+    """The arrays B, A and R of the tangent (n, n) [N m^-4] (module docstring), for n modes and S points."""
 
-    slopes: jax.Array  # B: gradients of the modes (9, S, n) [1/m]
+    slopes: jax.Array  # B: gradients of the modes (9, S, n) [m^-2.5]
     moduli: jax.Array  # A: moduli times weights (9, 9, S) [N m]
-    rest: jax.Array  # R: inertia, springs and pressures (n, n) [N/m]
+    rest: jax.Array  # R: inertia, springs and pressures (n, n) [N m^-4]
 
 
 def in_single_precision(slopes: jax.Array) -> SinglePrecision:
-    """Return the gradients of the n modes at the S points (9, S, n) [1/m] in single precision."""
+    """Return the gradients of the n modes at the S points (9, S, n) [m^-2.5] in single precision."""
     light = jax.lax.stop_gradient(slopes).astype(jnp.float32)
     return SinglePrecision(light, light.reshape(-1, light.shape[-1]).T)
 
@@ -49,20 +49,20 @@ def tangent_times(K: ReducedTangent, x: jax.Array) -> jax.Array:
 
 
 def tangent_matrix(K: ReducedTangent) -> jax.Array:
-    """Return the tangent K of n modes as an assembled matrix (n, n) [N/m]."""
+    """Return the tangent K of n modes as an assembled matrix (n, n) [N m^-4]."""
     AB = jnp.sum(K.moduli[..., None] * K.slopes[None], axis=1)
     return jnp.tensordot(K.slopes, AB, axes=((0, 1), (0, 1))) + K.rest
 
 
 def near_inverse(K: ReducedTangent, light: SinglePrecision) -> jax.Array:
-    """Return an approximate inverse (n, n) [m/N] of the tangent K of n modes. K is assembled in single precision."""
+    """Return an approximate inverse (n, n) [m^4/N] of the tangent K of n modes. K is assembled in single precision."""
     AB = jnp.sum(K.moduli.astype(jnp.float32)[..., None] * light.slopes[None], axis=1)
     near = light.flat @ AB.reshape(-1, AB.shape[-1])
     return jnp.linalg.inv(near.astype(K.rest.dtype) + K.rest)
 
 
 def solved_by_tangent(K: ReducedTangent, light: SinglePrecision, b: jax.Array) -> jax.Array:
-    """Return the accurate solution x (n,) [m] of K x = b, with n unknowns. The function may be differentiated."""
+    """Return the accurate solution x (n,) [m^2.5] of K x = b, with n unknowns. The function may be differentiated."""
 
     def solve(_: object, b: jax.Array) -> jax.Array:
         near, limit = near_inverse(K, light), jnp.linalg.norm(b)

@@ -54,13 +54,13 @@ def reduce_scene(
         most_modes: maximum number of modes.
         point_tolerance: the reduced forces are converted to motions; the sampled points may neglect this fraction of
             the motions [1]. Default: `tolerance`.
-        runs: number of full runs. Two thirds of these runs use the first rows, and a first reduced model is made from
-            these runs. The other runs use the remaining rows for which this model has the largest corrections, relative
-            to the displacements. Default: all rows.
+        runs: number of full runs. Two thirds of them use the first rows. A preliminary reduced model is made from these
+            two thirds. The last third uses the remaining rows with the largest corrections of this model, relative to
+            the displacements (if the model has no correction: the largest displacements). Default: all rows.
 
     Raises:
         InputError: the scene has entries that reduced models do not support; a tolerance is not between 0 and 1; no run
-            converged; `runs` does not fit the number of rows; the rows have different time steps.
+            converged, or none moves the body; `runs` does not fit the number of rows; `rows` contains solve.dt.
     """
     refuse_unknown_physics(scene)
     point_tolerance = tolerance if point_tolerance is None else point_tolerance

@@ -58,8 +58,9 @@ class Within:
 def can_be_refined(scene: Scene) -> bool:
     """Return whether all entries of the scene can be converted to the refined mesh.
 
-    The pressure at the beginning, an inlet or an object in `scene.physics` cannot be converted if it has one number per
-    triangle or per node. A vessel can be converted if its position is known (not inside jit).
+    The following entries cannot be converted: an initial pressure with one number per vertex, an inlet with one
+    number per node or triangle, and an object in `scene.physics` with one number per triangle. A vessel can be
+    converted only if its position is known (not inside jit).
     """
 
     def plain(physics: Physics) -> bool:
@@ -130,7 +131,8 @@ def _mesh_and_within(old: TetMesh) -> tuple[TetMesh, Within]:
 
 
 def _with_nodes_between(old: TetMesh, mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
-    """Return the numbers `nodes`, and those of the new nodes between them on the same faces or edges of the body."""
+    """Return the node numbers `nodes`, and the numbers of the new nodes that lie between them (see
+    `middles_of_places`)."""
     found = np.concatenate([nodes, np.setdiff1d(middles_of_places(old, nodes), nodes)])
     if mesh.order == 1:
         return found

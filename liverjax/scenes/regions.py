@@ -42,7 +42,7 @@ class Region:
 
 
 def select_elements(mesh: TetMesh, where: dict[str, float] | None, set: str | None, name: str = "region") -> np.ndarray:
-    """Return the numbers of the elements in a set, or of those with all vertices in `where` (see `boundary.select`).
+    """Return the numbers of the elements in a set, or of the elements with all vertices in `where` (`boundary.select`).
 
     Raises:
         InputError: `where` and `set` are both given or both missing; the mesh has no such set; no element is found.
@@ -131,7 +131,7 @@ def law_number(law: Law, name: str) -> jax.Array:
     """Return the value that the parameter `name` has in the law of the scene. A region changes this parameter.
 
     Raises:
-        InputError: the law has no parameter with this name, or the name is that of a list of parameters.
+        InputError: the law has no parameter with this name, or the name belongs to a list of parameters.
     """
     value = names.get(law, name, refused_name(name))
     if isinstance(value, tuple):

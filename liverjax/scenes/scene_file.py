@@ -243,7 +243,7 @@ def _linear_mesh(table: dict, folder: Path) -> TetMesh:
 
 
 def _cylinder(table: dict, scale: float) -> TetMesh:
-    """Make the mesh of a cylinder. Optional keys refine the mesh near rims and rings, or match the circle's area."""
+    """Make the mesh of a cylinder. Optional keys refine it near rims and rings, or give it the area of the circle."""
     for key in ("radius", "height", "cell_size"):
         if key not in table:
             raise InputError(f"[mesh] shape = 'cylinder' needs {key}: give a length")

@@ -25,8 +25,8 @@ from liverjax.physics.viscosity import PARTS, Prony, check_part
 
 @struct
 class SpringpotSeries:
-    """A spring and K springpots in parallel: complex modulus, divided by the modulus of the law. They can be used only
-    in harmonic motion."""
+    """A spring and K springpots in parallel. Their complex modulus is relative to the modulus of the law. They can be
+    used only in harmonic motion."""
 
     times: Any = param("s", "tau_k (K,): at omega = 1/tau_k a springpot is as stiff as the law", above=0.0)
     exponents: Any = param("1", "alpha_k (K,): 0 is a spring, 1 a dashpot", lower=0.0, upper=1.0)

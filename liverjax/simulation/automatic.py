@@ -1,11 +1,12 @@
 """Choice of the linear solver for `linear_solver = "auto"`, from the size and the stiffness of the body.
 
 "auto" chooses a factorisation for a static body of at most 10,000 tetrahedra (a quadratic element counts as eight) in
-two cases. In the first case the bulk modulus is more than a thousand times the shear modulus. For at most 1,500
-tetrahedra, a ratio of a hundred is enough: in Newton's method the stiffness of such bodies has negative eigenvalues,
-and a factorisation can solve such systems. In the second case the worst element is a sliver. "auto" never chooses a
-factorisation if the body has friction, nodes that move together, follower pressures, or pressures as unknowns. In all
-other cases "auto" chooses conjugate gradients. The limits come from tests in `experiments/`.
+two cases. In the first case the bulk modulus is more than a thousand times the shear modulus. For a body of at most
+1,500 tetrahedra, a ratio above a hundred is enough: its stiffness can have negative eigenvalues during Newton's method,
+and conjugate gradients cannot solve such systems. In the second case an element is a sliver (quality below 0.001).
+"auto" never chooses a factorisation if the body has friction, nodes that move together, follower pressures, or
+pressures as unknowns. In all other cases "auto" chooses conjugate gradients. The limits come from tests in
+`experiments/`.
 """
 
 from collections.abc import Iterable, Mapping
@@ -39,15 +40,15 @@ def chosen(scene: Scene) -> Scene:
 
 
 def with_solver(scene: Scene, rows: Iterable[Mapping[str, object]]) -> Scene:
-    """Choose one linear solver for all parameter sets, because one compiled program runs all of them.
+    """Return the scene with one linear solver for all parameter sets, because one compiled program runs all of them.
 
-    Inside the compiled program the numbers are unknown. So "direct" is chosen here if any parameter set needs it.
-    Otherwise `linear_solver` stays "auto".
+    Inside the compiled program the numbers are unknown. So "auto" is replaced here by "direct" if any parameter set
+    needs a factorisation. Otherwise the scene does not change.
 
     Args:
         scene: `Scene`.
-        rows: parameter sets, each with dotted names -> numbers (see `with_parameters`). Numbers that are unknown
-            inside jit, grad or vmap are ignored.
+        rows: parameter sets: dotted names -> numbers (see `with_parameters`). Numbers that are unknown inside jit, grad
+            or vmap are ignored.
     """
     direct = replace(scene, solve=replace(scene.solve, linear_solver="direct"))
     if scene.solve.linear_solver != "auto" or not _may_factorise(_with_form(scene)):
@@ -71,7 +72,7 @@ def linear_solver(scene: Scene) -> str:
 
 
 def _may_factorise(scene: Scene) -> bool:
-    """Whether the number of elements and the physics allow a factorisation. Moduli and element shapes do not count."""
+    """Return whether the number of elements and the physics allow a factorisation, for any moduli and shapes."""
     solve = scene.solve
     if solve.volumetric == "mixed" or any(physics.ties for physics in scene.physics):
         return False
@@ -82,12 +83,12 @@ def _may_factorise(scene: Scene) -> bool:
 
 
 def _size(scene: Scene) -> int:
-    """Number of elements; a quadratic element counts as eight, since it has about eight times as many unknowns."""
+    """Return the number of elements. A quadratic element counts as eight: it has about eight times as many unknowns."""
     return scene.mesh.number_of_elements * (1 if scene.mesh.order == 1 else 8)
 
 
 def _is_stiff(scene: Scene) -> bool:
-    """Whether the bulk modulus is far above the shear modulus. Returns False if the moduli are unknown (as in jit)."""
+    """Return whether the bulk modulus is far above the shear modulus; False if the moduli are unknown (as in jit)."""
     try:
         shear = scene.law.shear_modulus()
         bulk = scene.law.bulk_modulus() if scene.porosity is None else scene.porosity.limit_bulk
@@ -100,7 +101,7 @@ def _is_stiff(scene: Scene) -> bool:
 
 
 def _is_thin(scene: Scene) -> bool:
-    """Whether any element is a sliver. Returns False if the points are unknown (inside jit, grad or vmap)."""
+    """Return whether any element is a sliver; False if the points are unknown (inside jit, grad or vmap)."""
     points, volumes = scene.mesh.points, scene.mesh.volumes
     if isinstance(points, jax.core.Tracer) or isinstance(volumes, jax.core.Tracer):
         return False
@@ -127,13 +128,13 @@ def form_of_volumes(scene: Scene) -> str:
 
 
 def thinnest(points: np.ndarray, tetrahedra: np.ndarray, volumes: np.ndarray) -> float:
-    """Lowest quality of all elements (see `qualities`)."""
+    """Return the lowest quality of all elements (see `qualities`)."""
     return float(np.min(qualities(points, tetrahedra, volumes)))
 
 
 def qualities(points: np.ndarray, tetrahedra: np.ndarray, volumes: np.ndarray) -> np.ndarray:
-    """Quality (E,) of elements: volume, divided by the volume of a regular tetrahedron with the same mean squared edge
-    length."""
+    """Return the quality (E,) of each element: its volume, divided by the volume of a regular tetrahedron with the same
+    mean squared edge length."""
     corners = points[tetrahedra]
     edges = np.stack([corners[:, a] - corners[:, b] for a in range(4) for b in range(a)], axis=1)
     length = np.sqrt(np.mean(np.sum(edges**2, axis=2), axis=1))

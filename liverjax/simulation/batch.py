@@ -1,8 +1,8 @@
 """Many runs of one scene with different parameters, in one compiled program on all devices of the process.
 
-Each run of the batch has one parameter set. On a CPU each device does one run after another. Several runs at once
-(vmap) would be slower on a CPU, because every loop would wait for the slowest run. On a GPU each device does all of its
-runs at once.
+Each run of the batch has one parameter set. On a CPU each device does one run after another. Simultaneous runs (vmap)
+would be slower on a CPU, because every loop would wait for the slowest run. On a GPU each device does all of its runs
+simultaneously.
 """
 
 from typing import Any
@@ -25,7 +25,7 @@ STRATEGIES = ("map", "vmap")
 
 @struct
 class Batch:
-    """Results of N runs of T steps. `result.status` has the shape (N, T). A failed run does not change other runs."""
+    """Results of N runs of T steps. `result.status` has the shape (N, T). A failed run does not affect other runs."""
 
     result: Result = param("1", "every field with a leading axis of N runs")
     reference: jax.Array | None = param(
@@ -38,7 +38,7 @@ class Batch:
 
 
 def strategy_for(platform: str) -> str:
-    """Fastest strategy on a platform: "map" on a CPU, "vmap" on other platforms."""
+    """Return the fastest strategy on a platform: "map" on a CPU, "vmap" on other platforms."""
     return "map" if platform == "cpu" else "vmap"
 
 
@@ -54,9 +54,9 @@ def simulate_batch(
         devices: devices that share the runs; None: all devices of the process.
 
     Raises:
-        InputError: there are no parameters; two parameters have different numbers of values; the scene does not have
-            one of the names; "vmap" is used with robust steps on a CPU; or `simulate` would raise InputError for a
-            parameter set (the message then begins with the number of this set).
+        InputError: `strategy` is unknown; there are no parameters; two parameters have different numbers of values; the
+            scene has no number with one of the names; "vmap" is used on a CPU although `robust` is not "off"; or
+            `simulate` would raise InputError for a parameter set (the message then begins with the number of this set).
     """
     devices = jax.local_devices() if devices is None else devices
     strategy = strategy_for(devices[0].platform) if strategy is None else strategy
@@ -112,7 +112,7 @@ def _lanes(parameters: dict[str, jax.Array]) -> int:
     return int(lengths[first] or 0)
 
 
-#: Tables of a scene whose numbers are checked only for their bounds in all parameter sets but the first.
+#: If the parameters change only numbers of these tables, the sets after the first one are checked only for bounds.
 _MATERIAL = ("law", "viscosity", "porosity", "body", "region", "traction", "solve")
 
 
@@ -120,14 +120,14 @@ def _checked_lanes(scene: Scene, parameters: dict[str, jax.Array]) -> list[dict[
     """Check the numbers of each parameter set and return the sets, or an empty list inside jit, grad or vmap.
 
     Raises:
-        InputError: `simulate` would raise InputError for a parameter set. The message begins with the number of the
+        InputError: `simulate` would raise InputError for a parameter set. The message begins with the number of this
             set.
     """
     if any(isinstance(value, jax.core.Tracer) for value in parameters.values()):
         return []
     on_host = {name: np.asarray(value) for name, value in parameters.items()}
     lanes = [{name: value[k] for name, value in on_host.items()} for k in range(_lanes(parameters))]
-    # Moduli, densities and loads need only their bounds. Positions and directions need all checks.
+    # For moduli, densities and loads, a check of the bounds is enough. Positions and directions need all checks.
     placed = any(name.split(".")[0] not in _MATERIAL for name in on_host)
     for k, values in enumerate(lanes):
         own = with_parameters(scene, values)

@@ -47,7 +47,7 @@ LEAST_J, MOST_J = 0.2, 5.0
 
 
 def cautions_of_run(scene: Scene, result: Result) -> list[str]:
-    """Warnings about the mesh, the loads, the contacts and the volumes of a run; the list may be empty.
+    """Return warnings about the mesh, the loads, the contacts and the volumes of a run. The list may be empty.
 
     Args:
         scene: a `Scene` with known numbers (not inside jit, grad or vmap).
@@ -72,7 +72,7 @@ _SMALL = 0.02
 
 
 def mesh_sentence(scene: Scene, result: Result) -> str:
-    """Return a sentence about the mesh error of the positions at the last step, with a remedy if the error is large."""
+    """Return a sentence about the mesh error of the positions at the last step, with advice if the error is large."""
     assert result.mesh_error is not None
     if np.asarray(result.status)[-1] not in (status.CONVERGED, status.ONE_STEP):
         return "the mesh error is unknown, because the last step failed"
@@ -108,7 +108,7 @@ def mesh_sentence(scene: Scene, result: Result) -> str:
 
 
 def _pressure_errors(result: Result) -> tuple[str, str]:
-    """Return two additions to the sentence of `mesh_sentence`: an omitted error, and the error of the pressures."""
+    """Return two parts of `mesh_sentence` (or ""): that the pressure error is omitted, and how large this error is."""
     if result.pressure is None or result.mesh_error is None:
         return "", ""
     if result.mesh_error.pressure is None:
@@ -118,7 +118,7 @@ def _pressure_errors(result: Result) -> tuple[str, str]:
 
 
 def cautions_of_mesh(mesh: TetMesh) -> list[str]:
-    """Warnings about the size of the body, nodes with equal coordinates, hanging nodes, and slivers."""
+    """Return warnings about the size of the body, nodes with equal coordinates, hanging nodes, and slivers."""
     points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     size, quality = float(np.ptp(points, axis=0).max()), qualities(points, tets, np.asarray(mesh.volumes))
     said = []
@@ -196,8 +196,8 @@ def _of_stress_at_start(scene: Scene, result: Result) -> list[str]:
 def _of_growing_motion(scene: Scene, result: Result) -> list[str]:
     """Warn if the kinetic energy of a body under constant loads exceeds the work of these loads.
 
-    Newmark's method conserves energy only in small motions. If a time step is as long as a period of the motion, large
-    motions can grow.
+    Newmark's method conserves the energy of small motions only. If a time step is as long as a period of the motion,
+    large motions can grow.
     """
     body, solve = scene.body, scene.solve
     if solve.kind != "dynamic" or solve.integrator != "newmark" or body is None:
@@ -225,9 +225,9 @@ def _of_growing_motion(scene: Scene, result: Result) -> list[str]:
 
 
 def _gives_no_energy(physics: Physics) -> bool:
-    """Return whether a physics object (support, obstacle, …) is passive. The object has no history.
+    """Return whether a physics object (support, obstacle, …) is passive. The object must not have a history.
 
-    A passive object stores no energy at the beginning of the run. Later it gives the body only energy that it has taken
+    A passive object stores no energy at the beginning of the run. Later it returns only energy that it has received
     from the body.
     """
     if isinstance(physics, Obstacle):
@@ -243,7 +243,10 @@ BETWEEN = 0.25
 
 
 def _between_points(name: str, obstacle: Obstacle, scene: Scene, result: Result, moved: jax.Array) -> list[str]:
-    """Warn if the obstacle, displaced by `moved` (T, 3) at T steps, overlaps the body between the contact points."""
+    """Warn if the obstacle overlaps the body between the contact points, at its last or largest displacement.
+
+    `moved` (T, 3) contains the displacements [m] of the obstacle at T steps.
+    """
     last = len(moved) - 1
     for k in {int(jnp.argmax(jnp.linalg.norm(moved, axis=1))), last}:
         x = jnp.asarray(result.positions[k], scene.mesh.points.dtype)
@@ -258,7 +261,7 @@ def _between_points(name: str, obstacle: Obstacle, scene: Scene, result: Result,
 
 
 def _lost_contact(name: str, obstacle: Obstacle, scene: Scene, result: Result, moved: np.ndarray) -> str:
-    """Warn if the obstacle, displaced by `moved` (T + 1, 3) from step 0 on, passed the surface within a step."""
+    """Warn if the obstacle passed the surface within a step. `moved` (T + 1, 3): its displacements from step 0 on."""
     ways, radius = np.linalg.norm(np.diff(moved, axis=0), axis=1), float(np.asarray(obstacle.radius))
     centres, axis = np.asarray(obstacle.position, float) + moved, np.asarray(obstacle.axis, float)
     if obstacle.shape == "cylinder":  # a motion of a cylinder along its axis does not count
@@ -357,9 +360,9 @@ def _of_pressures(scene: Scene, result: Result) -> list[str]:
 
 
 def _height_beside(scene: Scene, at: np.ndarray, faces: np.ndarray) -> float:
-    """Median height [m] of the elements with numbers `at`. The height is measured from one face of each element.
+    """Return the median height [m] of the elements with the numbers `at`, measured from one face of each element.
 
-    In `faces` (E, 4), the corners of this face are true.
+    The entries of `faces` (E, 4) are true for the three corners of this face.
     """
     corners = np.asarray(scene.mesh.points)[np.asarray(scene.mesh.tetrahedra)[at]]
     base = corners[faces[at]].reshape(-1, 3, 3)
@@ -370,7 +373,7 @@ def _height_beside(scene: Scene, at: np.ndarray, faces: np.ndarray) -> float:
 def of_drained_layer(scene: Scene, seconds: float, when: str) -> list[str]:
     """Warn if the layer that drains in `seconds` is thinner than the elements at the drained nodes.
 
-    `when` is the beginning of the message: the time in words.
+    `when` is the beginning of the message. It contains a format field for `seconds`.
 
     In a time t, a layer of the thickness sqrt(c t) drains, with the diffusivity c = kappa / (1/K_lim + 1/M) (Biot
     1941). kappa is the permeability, and 1/K_lim is the storage (see `liverjax.physics.porosity`). M = K0 + 4/3 mu,
@@ -402,8 +405,8 @@ def of_drained_layer(scene: Scene, seconds: float, when: str) -> list[str]:
 
 
 def _moduli_and_permeability(scene: Scene, at: np.ndarray) -> tuple[float, float, float]:
-    """Return medians over the elements with numbers `at`: the longitudinal modulus K0 + 4/3 mu and the limit K_lim
-    [Pa], and the permeability [m^4/(N s)]. The parameters of regions are used.
+    """Return medians over the elements with the numbers `at`: the longitudinal modulus K0 + 4/3 mu [Pa], the storage
+    modulus K_lim [Pa], and the permeability [m^4/(N s)]. Parameters of regions are included.
 
     Raises:
         InputError: the law has no moduli.
@@ -433,7 +436,7 @@ def _of_overshoot(scene: Scene, P: np.ndarray) -> list[str]:
     The fluid volume that leaves an element within a step is distributed to all nodes of the element. In one dimension,
     with dt < h^2/(4 kappa M), this distribution couples neighbouring nodes more strongly than the flow does (h: height
     of the elements, kappa: permeability, M: longitudinal modulus). In three dimensions the smallest dt without
-    overshoot is about 1.5 times this bound. Such bounds are known since Vermeer and Verruijt 1981 (Int. J. Numer. Anal.
+    overshoot is about 1.5 times this bound. Source of such bounds: Vermeer and Verruijt 1981 (Int. J. Numer. Anal.
     Methods Geomech. 5, 1).
     """
     sponge, tets, V = scene.porosity, np.asarray(scene.mesh.tetrahedra), scene.mesh.number_of_vertices
@@ -449,7 +452,7 @@ def _of_overshoot(scene: Scene, P: np.ndarray) -> list[str]:
     beside = np.zeros(V, bool)
     beside[tets[at].ravel()] = True
     beside &= ~given
-    inner = np.zeros((V, len(P)))  # the largest pressure of neighbours further inside
+    inner = np.zeros((V, len(P)))  # the largest |pressure| of neighbours further inside
     for a, b in ((a, b) for a in range(4) for b in range(4) if a != b):
         one = beside[tets[:, a]] & ~given[tets[:, b]] & ~beside[tets[:, b]]
         np.maximum.at(inner, tets[one, a], np.abs(P[:, tets[one, b]]).T)

@@ -48,7 +48,7 @@ class Equations(NamedTuple):
     state: State  # state at the beginning of the step
     k: Number  # number of the step, from 1
     free: Free
-    noise: Number  # [N] added to the sum of all force norms in the tolerance, so that an unloaded body converges
+    noise: Number  # [N] added to the sum of all force norms, so that iterations for an unloaded body converge
     roundoff: jax.Array  # [N] norm of the nodal forces due to roundoff of the positions
     moved: tuple[jax.Array, jax.Array] | None  # (V, 3) [m] prescribed displacements before and after the step
 
@@ -108,12 +108,12 @@ def free_directions(scene: Scene) -> Free:
 
 
 def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
-    """State at the beginning of a run: at rest in the reference positions, or in positions `start` (V, 3) [m]."""
+    """Return the state at the beginning of a run: at rest in the reference positions, or at `start` (V, 3) [m]."""
     x = scene.mesh.points if start is None else start
     physics, free = physics_of(scene), free_directions(scene)
 
     def force() -> jax.Array:
-        """Nodal forces at x without inertia. The initial acceleration follows from these forces."""
+        """Return the nodal forces at x without inertia. The initial acceleration follows from these forces."""
         if start is not None or (scene.porosity is not None and scene.porosity.initial_pressure is not None):
             return _forces_at_beginning(scene, x)
         # At rest in the reference positions only nodal forces act.
@@ -129,7 +129,7 @@ def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
 
 
 def _forces_at_beginning(scene: Scene, x: jax.Array) -> jax.Array:
-    """Forces (V, 3) [N] of all physics at positions x (V, 3), with the internal variables of a body at rest.
+    """Return the forces (V, 3) [N] of all physics at positions x (V, 3), with the internal variables of a body at rest.
 
     Inertia and the forces that act only at the end of a step (`NodalForce.at_end`) are omitted.
     """
@@ -149,15 +149,15 @@ def _first_step(scene: Scene, x: jax.Array, free: Free) -> Step:
 
 
 def _with_tied(physics: tuple[Physics, ...], step: Step) -> Step:
-    """Add the nodes that move together to the step."""
+    """Return the step with its groups of nodes that move together."""
     tied = tuple(nodes for nodes in (p.tied(step) for p in physics) if nodes is not None)
     return step._replace(free=step.free._replace(tied=tied))
 
 
 def _prescribed_acceleration(scene: Scene, physics: tuple[Physics, ...], step: Step) -> jax.Array | None:
-    """Acceleration (V, 3) [m/s^2] at the end of a step of Newmark's method, where the motion is given; 0 elsewhere.
+    """Return the prescribed acceleration (V, 3) [m/s^2] at the end of a step of Newmark's method; 0 for free motion.
 
-    None if no motion is given, or for other methods, which do not need it.
+    Return None if no motion is prescribed, or for other methods, which do not need this acceleration.
     """
     if not step.averaged:
         return None
@@ -174,7 +174,7 @@ def _prescribed_acceleration(scene: Scene, physics: tuple[Physics, ...], step: S
 
 
 def force_sizes(scene: Scene) -> Sizes:
-    """Norms [N] of the nodal forces due to a unit strain along x, and due to rounding of the positions.
+    """Return the norms [N] of the nodal forces due to a unit strain along x, and due to rounding of the positions.
 
     The tolerance uses these norms, so that the iterations for a body without loads converge in spite of roundoff.
     """
@@ -197,7 +197,7 @@ def force_sizes(scene: Scene) -> Sizes:
 
 
 def _roundoff_at_nodes(scene: Scene, rounded: jax.Array) -> jax.Array:
-    """Norm [N] of the forces of springs and masses if the nodes move by `rounded` (V, 3) [m] from the reference shape.
+    """Return the norm [N] of the spring and mass forces due to a motion `rounded` (V, 3) [m] from the reference shape.
 
     Contact is omitted, because the contact points are not known before the step.
     """
@@ -215,7 +215,7 @@ def _roundoff_at_nodes(scene: Scene, rounded: jax.Array) -> jax.Array:
 
 
 def _is_spring(acting: NodalForce) -> bool:
-    """Whether the class of `acting` defines a stiffness, so that its force changes with the positions."""
+    """Return whether the class of `acting` defines a stiffness, so that its force changes with the positions."""
     own = type(acting)
     return own.stiffness is not NodalForce.stiffness or own.attached is not NodalForce.attached
 
@@ -234,10 +234,10 @@ def _of_physics(scene: Scene, physics: tuple[Physics, ...], state: State, k: Num
     eps = float(np.finfo(np.float64).eps)
     free, noise = step.free, 20 * eps * sizes.unit_strain
     if scene.solve.volumetric == "mixed":
-        # With volumetric = "mixed", inertia forces count in the tolerance only with a weight of about shear modulus
-        # divided by bulk modulus (`Mixed.counted`). In short time steps the roundoff of inertia forces exceeds this
-        # tolerance, so this roundoff is added. Single precision also uses the roundoff of double precision, so that a
-        # run that stops at a larger residual reports this.
+        # With volumetric = "mixed", inertia forces enter the sum of the force norms only with a weight of about shear
+        # modulus / bulk modulus (`Mixed.counted`). In short time steps the roundoff of inertia forces exceeds the
+        # tolerance that follows from this sum, so this roundoff is added. In single precision, too, the roundoff of
+        # double precision is added. So a single-precision run that stops at a larger residual is reported.
         noise = noise + ROUNDINGS * sizes.roundoff * (eps / float(jnp.finfo(state.x.dtype).eps))
     return Equations(
         scene=scene,
@@ -253,7 +253,7 @@ def _of_physics(scene: Scene, physics: tuple[Physics, ...], state: State, k: Num
 
 
 def _prescribed_motion(scene: Scene, k: Number) -> tuple[jax.Array, jax.Array] | None:
-    """Prescribed displacements (V, 3) [m] before and after step k, or None if no displacement is prescribed."""
+    """Return the prescribed displacements (V, 3) [m] before and after step k, or None if none is prescribed."""
     if not scene.displaced:
         return None
     solve = scene.solve
@@ -265,7 +265,7 @@ def _prescribed_motion(scene: Scene, k: Number) -> tuple[jax.Array, jax.Array] |
 
 
 def positions(e: Equations, q: jax.Array, s: Number) -> jax.Array:
-    """Positions (V, 3) [m] from the unknowns q (3 V,) and the prescribed motion, at fraction s of the step."""
+    """Return the positions (V, 3) [m] for the unknowns q (3 V,) and the prescribed motion, at step fraction s."""
     held, free = e.mesh.points, e.free
     q = q[: 3 * e.mesh.number_of_nodes]
     if e.moved is not None:
@@ -302,10 +302,11 @@ def unknowns(e: Equations, x: jax.Array, pressure: jax.Array | None = None) -> j
 def in_directions_at(
     e: Equations, x: jax.Array | None, make: Callable[[Equations], Callable[[jax.Array], jax.Array]]
 ) -> Callable[[jax.Array], jax.Array]:
-    """Return the function of flat vectors (3 V,) that `make` returns for e, with the motions of rotating nodes at x.
+    """Return the function of flat vectors (3 V,) that `make` returns, if necessary with a change of directions.
 
-    Nodes that rotate together move along circles, so the directions of their motions change during a step. Vectors of
-    unknowns have the directions at the beginning of the step. At positions x (V, 3), the tangent has those at x.
+    Nodes that rotate together move along circles, so the directions of their motions change during a step. Flat vectors
+    use the directions at the beginning of the step. The function from `make` uses the directions at positions x (V, 3),
+    so its argument and its result are converted.
     """
     if x is None or all(nodes.linear for nodes in e.free.tied):
         return make(e)
@@ -322,11 +323,11 @@ def in_directions_at(
     return lambda vector: turned(function(turned(vector, e.free.tied, there)), there, e.free.tied)
 
 
-@jax.jit  # so that JAX evaluates this function only once for all its calls in a compiled program
+@jax.jit  # so that JAX traces this function only once for all its calls in a compiled program
 def forces(
     e: Equations, q: jax.Array, s: Number, guess: Guess | None = None, pressure: jax.Array | None = None
 ) -> Forces:
-    """Forces of all physics for the unknowns q (3 V,), at fraction s of the step.
+    """Return the forces of all physics for the unknowns q (3 V,), at fraction s of the step.
 
     The pressures of a flowing fluid can be given as `pressure` (V,) [Pa]. Otherwise they are computed, starting at
     `guess` if it is given.
@@ -349,7 +350,7 @@ def forces(
 
 
 def forces_at(scene: Scene, x: jax.Array) -> jax.Array:
-    """Forces (V, 3) [N] that keep the nodes in equilibrium at positions x (V, 3), for a scene without supports."""
+    """Return the external forces (V, 3) [N] that would hold the nodes at x (V, 3), in a scene without supports."""
     none = jnp.zeros(())
     e = equations(scene, initial_state(scene), 1.0, Sizes(none, none))
     q = unknowns(e, x)
@@ -357,7 +358,7 @@ def forces_at(scene: Scene, x: jax.Array) -> jax.Array:
 
 
 def _unknown_pressure(e: Equations, q: jax.Array) -> jax.Array:
-    """Pressures (V,) [Pa] of the vertices from the unknowns q."""
+    """Return the pressures (V,) [Pa] of the vertices from the unknowns q."""
     return e.mixed.unit * q[3 * e.mesh.number_of_nodes :]
 
 
@@ -369,13 +370,13 @@ def settled(e: Equations, q: jax.Array, s: Number | None = None) -> jax.Array:
 
 
 def flowing_pressure(e: Equations, q: jax.Array, s: Number, guess: Guess) -> jax.Array:
-    """Pressures (V,) [Pa] of a flowing fluid for the unknowns q (3 V,). The solver starts at `guess`."""
+    """Return the pressures (V,) [Pa] of a flowing fluid for the unknowns q (3 V,). The solver starts at `guess`."""
     assert e.volume is not None
     return e.volume.pressure(e.mesh, determinant(deformation_gradient(e.mesh, positions(e, q, s))), guess)
 
 
 def flowing_lack(e: Equations, q: jax.Array, pressure: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Out-of-balance forces (3 V,) [N] at the end of a step, and residual (V,) of the pressure equation.
+    """Return the out-of-balance forces (3 V,) [N] at the end of a step, and the residual (V,) of the pressure equation.
 
     `pressure` (V,) [Pa] contains the pressures at the end of the step.
     """
@@ -385,7 +386,7 @@ def flowing_lack(e: Equations, q: jax.Array, pressure: jax.Array) -> tuple[jax.A
 
 
 def _along_free(e: Equations, f: Forces) -> jax.Array:
-    """Forces (V, 3) [N] in the directions in which the nodes can move.
+    """Return the forces (V, 3) [N] in the directions in which the nodes can move.
 
     The rounding of the first projection leaves a small part of each reaction in the directions that are not free. No
     motion can balance this part, and a linear solve for a very small derivative would never converge. So the forces
@@ -398,11 +399,11 @@ def _along_free(e: Equations, f: Forces) -> jax.Array:
 def residual(
     e: Equations, q: jax.Array, s: Number, guess: Guess | None = None
 ) -> tuple[jax.Array, jax.Array, jax.Array | None]:
-    """Out-of-balance forces (3 V,) [N] at fraction s of the step, sum of the norms of all forces [N], and pressures.
+    """Return out-of-balance forces (3 V,) [N] at fraction s of the step, the sum of all force norms, and the pressures.
 
-    If pressures are unknowns, the residual of the pressure equation, times `e.mixed.unit` [N], follows the forces. In
-    the sum of the norms, the weight of the isochoric forces is then 1, and the weight of the other forces is about the
-    shear modulus divided by the bulk modulus (see `Mixed.counted`).
+    The sum [N] also contains `e.noise`. If pressures are unknowns, the residual of the pressure equation, times
+    `e.mixed.unit` [N], follows the forces. In the sum, the weight of the isochoric forces is then 1, and the weight of
+    the other forces is about the shear modulus divided by the bulk modulus (see `Mixed.counted`).
     """
     f = forces(e, q, s, guess)
     at_work = jnp.linalg.norm(f.internal)
@@ -417,7 +418,7 @@ def residual(
 
 
 def energy(e: Equations, q: jax.Array, start: jax.Array) -> jax.Array:
-    """Energy [J] of a step as a function of the unknowns q: the sum of the incremental potentials of all force terms.
+    """Return the energy [J] of a step for the unknowns q: the sum of the incremental potentials of all force terms.
 
     At `start` the gradient of the energy is the residual. If all forces have an energy, this is true at every q.
     """
@@ -439,8 +440,9 @@ def advanced(e: Equations, end: End, by_end_forces: jax.Array | None = None) -> 
 def reported_forces(e: Equations, total: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array | None]:
     """Return (f, a): f (V, 3) [N] is the sum of all forces, from which the reactions follow.
 
-    Terms with `NodalForce.at_end` act only at the end of a step. Their forces are doubled in `total`, but not in f. The
-    array a (V, 3) [m/s^2] is minus the accelerations due to these forces, or None if there are no such forces.
+    Terms with `NodalForce.at_end` act only at the end of a step. Their forces are doubled in `total`. In directions
+    that are not free, f contains these forces only once. The array a (V, 3) [m/s^2] is minus the accelerations due to
+    the doubled forces, or None if there are no such forces.
 
     Args:
         total: sum of all forces (V, 3) [N] in the step's equations, at positions x (V, 3).
@@ -454,12 +456,12 @@ def reported_forces(e: Equations, total: jax.Array, x: jax.Array) -> tuple[jax.A
 
 
 def _at_end(e: Equations, x: jax.Array, s: Number) -> list[jax.Array]:
-    """Doubled forces (V, 3) [N], at fraction s of the step, of the terms that act only at the end of a step."""
+    """Return the doubled forces (V, 3) [N], at step fraction s, of each term that acts only at the end of a step."""
     return [a.force(e.mesh, x, s) for a in e.nodal if a.at_end]
 
 
 def outputs(scene: Scene, state: State) -> dict[str, jax.Array]:
-    """Additional results at a state, by name, for example the pressures of a fluid at the nodes."""
+    """Return additional results at a state, by name, for example the pressures of a fluid at the nodes."""
     shown: dict[str, jax.Array] = {}
     for physics, memory in zip(physics_of(scene), state.memories, strict=True):
         shown |= {name: on_middles(scene.mesh, field) for name, field in physics.output(memory).items()}

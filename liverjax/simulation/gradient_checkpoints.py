@@ -36,7 +36,7 @@ def number_kept(store: str | int, steps: int) -> int:
 
 
 def lengths(steps: int, kept: int) -> tuple[int, int, int]:
-    """Number of full segments, steps per segment, and steps in a shorter last segment (0 if there is none)."""
+    """Return the number of full segments, of steps per segment, and of steps in a shorter last segment (or 0)."""
     length = math.ceil(steps / kept)
     return steps // length, length, steps % length
 

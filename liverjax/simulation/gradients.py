@@ -58,8 +58,8 @@ def value_and_gradient(
             no memory for the steps, but costs one run per parameter.
 
     Raises:
-        InputError: `mode` or `store` is unknown; `at` is empty; the scene does not have one of the names; or there is
-            one of the causes that `simulate` lists.
+        InputError: `mode` or `store` is unknown; `at` is empty; the scene has no number with one of the names; or
+            `simulate` would raise InputError.
     """
     if mode not in MODES:
         raise InputError(f"mode = {mode!r} is not known: use {' or '.join(MODES)}")

@@ -64,8 +64,8 @@ def coupled(
 def balances(
     mesh: TetMesh, A: block_matrix.BlockMatrix | PointMatrix, motion: Sequence[jax.Array]
 ) -> tuple[tuple[jax.Array, ...], jax.Array]:
-    """Forces [N], as columns (V,), and change (V,) of the volume balance, due to the displacement `motion` at constant
-    pressures."""
+    """Return the effect of the displacement `motion` at constant pressures: forces [N], as columns (V,), and the change
+    (V,) of the volume balance."""
     if isinstance(A, PointMatrix):
         return point_matrix.product(mesh, A, motion), -point_matrix.volume_changes(mesh, A, motion)
     *forces, balance = block_matrix.product(A, motion)
@@ -79,7 +79,7 @@ def pressure_change(
     balance: jax.Array,
     exactly: bool = False,
 ) -> jax.Array:
-    """Change of the pressures (V,) that reduces the residual `balance` (V,) of the pressure equation to 0.
+    """Return the change of the pressures (V,) that reduces the residual `balance` (V,) of the pressure equation to 0.
 
     Without `flow` the pressure matrix is diagonal. With `flow` the pressure equation is solved approximately, or to its
     tolerance if `exactly` is true.
@@ -113,7 +113,7 @@ def with_pressures(
 
 
 def without_pressures(mesh: TetMesh, volume: Any, A: PointMatrix, motion: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
-    """Forces, as columns (V,), due to a displacement and the pressures that it causes, for quadratic elements.
+    """Return the forces, as columns (V,), due to a displacement and the pressures that it causes (quadratic elements).
 
     A polynomial approximates the inverse of the pressure matrix, so that this product stays symmetric. In tetrahedra
     the pressure matrix divided by its diagonal has eigenvalues between 1/2 and 5/2 (Wathen 1987).
@@ -125,7 +125,7 @@ def without_pressures(mesh: TetMesh, volume: Any, A: PointMatrix, motion: Sequen
 
 
 def pulled(mesh: TetMesh, A: PointMatrix | block_matrix.BlockMatrix, pressures: jax.Array) -> tuple[jax.Array, ...]:
-    """Forces, as columns (V,), of vertex pressures (V,) [Pa], which push outwards if they are positive."""
+    """Return the forces, as columns (V,), of vertex pressures (V,) [Pa]. Positive pressures push outwards."""
     if isinstance(A, block_matrix.BlockMatrix):
         rows, diagonal = (tuple(row[3:] for row in blocks[:3]) for blocks in (A.rows, A.diagonal))
         return block_matrix.product(block_matrix.BlockMatrix(rows, diagonal, A.nodes), (-pressures,))
@@ -133,18 +133,17 @@ def pulled(mesh: TetMesh, A: PointMatrix | block_matrix.BlockMatrix, pressures: 
 
 
 def undrained_bulk(mesh: TetMesh, C: block_matrix.BlockMatrix, mask: Number) -> jax.Array:
-    """Stiffness [Pa/m^3] of each integration point against a volume change, if nothing flows between elements.
+    """Return the stiffness [Pa/m^3] of each integration point against a volume change, if no fluid leaves an element.
 
     C is the pressure matrix. `mask` (V,) is 0 where the pressure is given, else 1. The diagonal of C is divided among
-    the elements in proportion to their volumes. The sum of these stiffnesses is then at least as stiff as the true
-    matrix.
+    the elements in proportion to their volumes. The assembled matrix is then at least as stiff as the true matrix.
     """
     share = integrals(mesh, jnp.ones_like(mesh.volumes)) * mask / C.diagonal[0][0]
     return interpolated(mesh, share) / mesh.weights
 
 
 def undrained_diagonal(A: block_matrix.BlockMatrix, mask: Number) -> block_matrix.Block:
-    """Diagonal blocks of K + G^T D^-1 G, with the diagonal D of the pressure matrix.
+    """Return the diagonal blocks of K + G^T D^-1 G, with the diagonal D of the pressure matrix.
 
     K is the stiffness at given pressures, and G couples pressures and positions. `mask` (V,) is 0 where the pressure is
     given, else 1. If nothing flows, the result is exact.

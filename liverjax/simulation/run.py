@@ -97,7 +97,7 @@ def _run_part(
 ) -> tuple[Result, State]:
     sizes = force_sizes(scene)
     kept, _ = beginning(equations(scene, state, numbers[0], sizes))
-    # With `inline`, JAX evaluates the function only once, for `eval_shape` and for the compiled program.
+    # With `inline`, JAX traces the function only once, for `eval_shape` and for the compiled program.
     advance = jax.jit(_step_by_step(scene, sizes, report, None, differentiable=False), inline=True)
 
     def unless_over(carry, k):
@@ -121,9 +121,9 @@ def simulate(
         scene: `Scene`.
         start: positions (V, 3) [m] at which the run begins, at rest, as if the body had just been moved there from the
             reference positions. No stress has relaxed yet, and the fluid responds to the change of volume in the first
-            step. None: the reference positions. If elements are inverted at `start`, use robust = "projected". Then a
-            static scene uses `start` as a guess. If the guess is inverted or does not lead to a solution, the run
-            begins at the reference positions.
+            step. None: the reference positions. If elements are inverted at `start`, use robust = "projected". With
+            this setting, a static scene uses `start` only as a guess. If the guess is inverted or does not lead to a
+            solution, the run begins at the reference positions.
         report: a Python function that is called with the number of each finished step, to show progress.
         store: number of states that reverse mode keeps: "all" (the end of every step), a whole number, or "sqrt" (the
             square root of the number of steps). The steps between kept states run a second time. Without derivatives
@@ -132,11 +132,12 @@ def simulate(
             the reference positions. The estimate can be differentiated in forward mode only.
 
     Raises:
-        InputError: unknown choices; a time step or a mass is missing; numbers out of bounds; a loaded mesh for which no
-            reference shape is found; precision "float64" although JAX's 64-bit mode is off. Inside jit, grad or vmap,
-            numbers are not checked; if no reference shape is found there, the points are NaN and the status of the
-            steps is NOT_FINITE. `check_scene`, which is called when a scene file is read, checks more: the mesh, the
-            positions of obstacles, and whether the supports prevent rigid motions.
+        InputError: unknown choices; harmonic motion or a reduced model; a time step or a mass is missing; numbers out
+            of bounds; a loaded mesh for which no reference shape is found; precision "float64" although JAX's 64-bit
+            mode is off; a wrong shape of `start`; `mesh_error` together with `start` or the one-step scheme. Inside
+            jit, grad or vmap, numbers are not checked. If no reference shape is found there, the points are NaN and the
+            status of the steps is NOT_FINITE. `check_scene`, which is called when a scene file is read, checks more:
+            the mesh, the positions of obstacles, and whether the supports prevent rigid motions.
     """
     scene = prepared(scene)
     check_time_and_mass(scene)
@@ -165,8 +166,8 @@ def simulate_part(
 ) -> tuple[Result, State]:
     """Run some steps. Return their results and the final state, so that a long run can be stored in parts.
 
-    This function is not differentiable. Every part of the run begins with a new tangent. So a run that continues from a
-    stored state gives exactly the same result.
+    This function is not differentiable. Every part of the run begins with a new tangent, whether the run was
+    interrupted or not. So a run that continues from a stored state gives exactly the same result.
 
     Args:
         scene: `Scene`.
@@ -205,10 +206,10 @@ def prepared(scene: Scene) -> Scene:
 def unloaded(scene: Scene) -> Unloaded:
     """Return the scene with the reference shape that the loads deform into the given mesh.
 
-    The reference points have derivatives with respect to all numbers of the scene. The loads are those at the beginning
-    of the run: histories have their value at time 0, and prescribed motion has not begun. The body has been under these
-    loads for a long time, so viscosity has relaxed. Under load the vertices of quadratic elements are at the given
-    positions. In the reference shape the edges of these elements are straight.
+    The reference points have derivatives with respect to all numbers of the scene. The loads have their values
+    at the beginning of the run: histories have their value at time 0, and prescribed motion has not begun. The body has
+    been under these loads for a long time, so viscous stress has relaxed. Under load the vertices of quadratic elements
+    are at the given positions. In the reference shape the edges of these elements are straight.
 
     Raises:
         InputError: in the same cases as `simulate`; the scene has a porous body or a rigid plate; no reference shape

@@ -75,9 +75,9 @@ def problem_of(e: Equations) -> Problem:
 
 
 def beginning(first: Equations, tangent_too: bool = False) -> tuple[Kept, tangent.Tangent | None]:
-    """Return an empty `Kept` for a run whose first step has the equations `first`, and the tangent at its beginning.
+    """Return an empty `Kept` for a run whose first step has the equations `first`, and a tangent.
 
-    The tangent is None unless `tangent_too` is true.
+    The tangent is computed at the positions at the beginning of the run. It is None unless `tangent_too` is true.
     """
     method, q = problem_of(first), unknowns(first, first.state.x)
     kept = step_cutting.nothing_kept(method, q)
@@ -132,10 +132,10 @@ def _finite(e: Equations) -> Equations:
 def step(
     e: Equations, kept: Kept | None = None, near: Any = None, differentiable: bool = True
 ) -> tuple[State, jax.Array, StepStatistics, Kept]:
-    """Solve a step. Return the next state, the reactions (V, 3) [N], statistics, and the tangent for the next step.
+    """Solve a step. Return the next state, the reactions (V, 3) [N], statistics, and the `Kept` for the next step.
 
-    `kept` contains the tangent of the last step. The linear solves for derivatives use the coarse space of the tangent
-    `near`, if it is given.
+    The argument `kept` contains the tangent of the last step. The linear solves for derivatives use the coarse space of
+    the tangent `near`, if it is given.
     """
     scene, x, solve = e.scene, e.state.x, e.scene.solve
     options = StepOptions(
@@ -144,7 +144,8 @@ def step(
         one_step=solve.newton == "one_step",
         differentiable=differentiable,
     )
-    # With inertia, the first guess is a motion at constant velocity. A one-step solve (book chapter) starts at x.
+    # With inertia, the first guess is a motion at constant velocity. It is not used with prescribed motion, or in the
+    # one-step scheme (book chapter).
     ahead = [guess for guess in (a.predicted() for a in e.nodal) if guess is not None]
     guess = unknowns(e, ahead[0]) if ahead and not scene.displaced and not options.one_step else None
     problem = problem_of(e)
@@ -174,8 +175,8 @@ def adjoint(
 
     With a flowing fluid, x also contains the pressures of the fluid, and b contains forces and minus the balance of
     volumes. The returned right-hand side (3 V,) is then what remains of b after the elimination of the pressures.
-    Otherwise it is b. Iterations begin with a combination of `earlier` solves if this reduces the residual. Follower
-    loads are not allowed. On a CPU, the columns of a Jacobian are solved one after another.
+    Without a flowing fluid, it is b. Iterations begin with a combination of `earlier` solves if this reduces the
+    residual. Follower loads are not allowed. On a CPU, the columns of a Jacobian are solved one after another.
     """
     if e.scene.solve.linear_solver == "direct":
         return _adjoint(e, K, b, (tolerance, max_iterations), earlier)

@@ -1,11 +1,12 @@
 """The tangent of the forces of a scene, computed from hand-derived stiffness blocks, and linear solves with it.
 
-The physics of the scene determine the method of the linear solves. Conjugate gradients solve symmetric systems, after
-nodal pressures are eliminated. BiCGSTAB solves two other kinds of systems: systems with follower loads or friction,
-which are not symmetric, and systems with pressures as unknowns, which have a non-symmetric preconditioner. The
-preconditioner consists of the inverse diagonal blocks of the stiffness. A coarse space, with few unknowns for motions
-of long wavelength, is added if these motions would need many iterations. Columns (V,) are the x, y and z components of
-a nodal vector in separate arrays. A flat vector (3 V,) contains the columns one after the other.
+With `linear_solver = "direct"` a factorisation solves the linear systems. Otherwise the physics of the scene determines
+the method. Conjugate gradients solve symmetric systems, after nodal pressures are eliminated. BiCGSTAB solves systems
+with follower loads or friction, because they are not symmetric. It also solves systems with pressures as unknowns,
+because their preconditioner is not symmetric. The preconditioner consists of the inverse diagonal blocks of the
+stiffness. A coarse space, with few unknowns for motions of long wavelength, is added if these motions would need many
+iterations. Columns (V,) are the x, y and z components of a nodal vector in separate arrays. A flat vector (3 V,)
+contains the columns one after the other.
 """
 
 from collections.abc import Callable, Sequence
@@ -60,7 +61,7 @@ def _of_kind(kind: Kind, make: Callable[[str], Any]) -> Any:
 
 
 def own_blocks(e: Equations, pressure: Any, F: Matrix, kind: Kind = "true") -> dict[tuple[int, int], Matrix]:
-    """Stiffness K_ab [N/m] between corners a and b (1 <= a <= b <= 3) at every integration point."""
+    """Return the stiffness K_ab [N/m] between corners a and b (1 <= a <= b <= 3) at every integration point."""
     return _of_kind(kind, partial(_own_blocks, e, pressure, F))
 
 
@@ -87,19 +88,19 @@ def _own_blocks(e: Equations, pressure: Any, F: Matrix, kind: str) -> dict[tuple
 def element_blocks(
     e: Equations, pressure: jax.Array | None, F: Matrix, kind: Kind = "true"
 ) -> dict[tuple[int, int], Matrix]:
-    """Stiffness K_ab [N/m] of every linear element for the node pairs (a, b) in `PAIRS`."""
+    """Return the stiffness K_ab [N/m] of every linear element for the node pairs (a, b) in `PAIRS`."""
     full = mjed.all_blocks(own_blocks(e, pressure, F, kind))
     return {(a, b): full[a][b] for a, b in PAIRS}
 
 
 def stiffness(e: Equations, pressure: jax.Array | None, x: jax.Array, kind: Kind = "true") -> BlockMatrix:
-    """Stiffness matrix of the elements and of the force terms at nodes, at positions x (V, 3) [m]."""
+    """Return the stiffness matrix of the elements and of the force terms at nodes, at positions x (V, 3) [m]."""
     K = element_blocks(e, pressure, deformation_gradient(e.mesh, x), kind)
     return block_matrix.force_matrix(e.mesh, K, node_blocks(e))
 
 
 def node_blocks(e: Equations) -> Block | None:
-    """Sum of the diagonal stiffness blocks (entries (V,) [N/m]) of force terms at nodes; None if no term has blocks."""
+    """Return the sum of the diagonal stiffness blocks (entries (V,) [N/m]) of force terms at nodes, or None."""
     total: Block | None = None
     for a in e.nodal:
         own = a.stiffness()
@@ -109,7 +110,7 @@ def node_blocks(e: Equations) -> Block | None:
 
 
 def _attached(e: Equations, x: jax.Array, s: Number, kind: Kind) -> tuple[Between, ...]:
-    """Stiffness between nodes (springs, contact …) of all force terms at nodes, and its rank-one changes `GivesWay`."""
+    """Return the stiffness between nodes (springs, contact …) of all force terms, and rank-one changes `GivesWay`."""
 
     def of(kind: str) -> tuple[Between, ...]:
         found: list[Between | None] = []
@@ -122,7 +123,7 @@ def _attached(e: Equations, x: jax.Array, s: Number, kind: Kind) -> tuple[Betwee
 
 
 def _symmetric(e: Equations, more: tuple[Between, ...]) -> tuple[Attached, ...]:
-    """Symmetric parts of the `Attached` matrices in `more`, for a preconditioner. Friction is not symmetric."""
+    """Return the symmetric parts of `Attached` matrices in `more`, for a preconditioner. Friction is not symmetric."""
     elements = tuple(own for own in more if isinstance(own, Attached))
     return elements if e.conservative else tuple(attached.symmetric_part(own) for own in elements)
 
@@ -134,13 +135,13 @@ def _with_diagonals(e: Equations, diagonal: Block, more: tuple[Attached, ...]) -
 
 
 def _shift(e: Equations) -> jax.Array | None:
-    """Stiffness (V,) [N/m] that acts on every node (inertia), or None if there is no such stiffness."""
+    """Return the stiffness (V,) [N/m] that acts on every node (inertia), or None if there is no such stiffness."""
     own = [a.stiffness() for a in e.nodal if a.everywhere]
     return own[0][0][0] if own and own[0] is not None else None
 
 
 def volume_with_pressures(e: Equations) -> VolumeStress | None:
-    """Force term with pressures that depend on the positions, or None if there is no such term."""
+    """Return the force term with pressures that depend on the positions, or None if there is no such term."""
     return e.volume if e.volume is not None and e.volume.coupled else None
 
 
@@ -168,7 +169,7 @@ def tangent(
     near: tuple[Any, Tangent] | None = None,
     kind: Kind = "true",
 ) -> Tangent:
-    """Derivative of the forces at positions x (V, 3) [m], at fraction s of the step. JAX treats it as a constant.
+    """Return the derivative of the forces at positions x (V, 3) [m] and step fraction s. JAX treats it as a constant.
 
     `pressure`: pressures at the nodes (V,) [Pa], or None without pressures. `near`: a flag and a tangent; if the flag
     is true, the coarse space of this tangent is used. `kind`: a `Kind`.
@@ -194,7 +195,7 @@ def tangent(
 
 
 def eliminates_pressures(e: Equations) -> bool:
-    """Whether pressure unknowns are eliminated in solves with a tangent that has no negative eigenvalues.
+    """Return whether pressure unknowns are eliminated in solves with a tangent that has no negative eigenvalues.
 
     Far from a solution, pressures and their stiffness are as large as the bulk modulus. Iterations for positions and
     pressures together are scaled by the shear modulus and do not converge there. After the elimination the matrix of
@@ -205,7 +206,7 @@ def eliminates_pressures(e: Equations) -> bool:
 
 
 def _thin(e: Equations) -> bool:
-    """Whether a coarse space of the pressure unknowns is made: true for linear elements if some elements are thin.
+    """Return whether the pressure unknowns have a coarse space: true for linear elements if some elements are thin.
 
     In strongly compressed quadratic elements a coarse space would increase the number of iterations.
     """
@@ -214,7 +215,7 @@ def _thin(e: Equations) -> bool:
 
 @jax.jit
 def _slow_pressures(e: Equations, K: Tangent) -> Coarse:
-    """Coarse space of the pressures, after approximate elimination of the displacements.
+    """Return the coarse space of the pressures, after approximate elimination of the displacements.
 
     In a layer between plates, pressures that vary slowly along the layer cause much smaller displacements than the
     mass matrix of the pressures suggests.
@@ -234,7 +235,7 @@ def _true(kind: Kind, dtype: Any) -> jax.Array:
     return jnp.asarray(kind == "true" if isinstance(kind, str) else ~kind[1], dtype)
 
 
-#: `matrix`, `inverse`, `vertices` of a `Tangent`, matrix of its coarse space, and the other stiffness between nodes.
+#: Fields `matrix`, `inverse` and `vertices` of a `Tangent`, the matrix of its coarse space, and its field `attached`.
 _Assembled = tuple[BlockMatrix | PointMatrix, Inverses, Inverses | None, BlockMatrix, tuple[Between, ...]]
 
 # The functions below are called several times in a compiled program. With jit, JAX traces them only once.
@@ -269,7 +270,7 @@ def _assembled(
 
 
 def _vertex_inverses(e: Equations, free: Free, A: BlockMatrix, diagonal: Block) -> Inverses:
-    """Inverses of the diagonal blocks of the matrix A of the vertices, and inverses for clusters of vertices."""
+    """Return the inverses of the diagonal blocks of the matrix A of the vertices, and of clusters of vertices."""
     single = block_matrix.inverse_blocks(diagonal, free.mask, free.normals)
     groups = _groups_in_use(e, e.mesh.pattern.clusters)
     entries = clusters.of_rows(groups, e.mesh.pattern.edge_slots, A)
@@ -283,13 +284,13 @@ def _groups_in_use(e: Equations, groups: Any) -> Any:
 
 @jax.jit
 def _coarse(e: Equations, A: BlockMatrix) -> Coarse:
-    """Coarse space of the vertices for the preconditioner."""
+    """Return the coarse space of the vertices for the preconditioner."""
     used = False if e.scene.solve.linear_solver == "direct" else worthwhile(A, _vertex_shift(e))
     return coarse(e.mesh, A, _coarse_mask(_of_vertices(e)), used)
 
 
 def _of_points(e: Equations, pressure: jax.Array | None, x: jax.Array, s: Number, kind: Kind) -> _Assembled:
-    """Tangent of quadratic elements: stiffness blocks at the integration points, and a two-level preconditioner."""
+    """Assemble the tangent of quadratic elements: blocks at integration points, and a two-level preconditioner."""
     mesh, volume = e.mesh, volume_with_pressures(e)
     F = deformation_gradient(mesh, x)
     A = PointMatrix(stored(own_blocks(e, pressure, F, kind)), node_blocks(e), None, None)
@@ -329,18 +330,18 @@ def _vertex_shift(e: Equations) -> jax.Array | None:
 
 
 def _coarse_mask(free: Free) -> jax.Array:
-    """Mask (V, 3) of the coarse space: 0 for fixed directions and for nodes that slide on oblique planes, else 1."""
+    """Return the coarse space's mask (V, 3): 0 for fixed directions and nodes that slide on oblique planes, else 1."""
     mask, normals = free[:2]
     return mask if normals is None else mask * jnp.all(normals == 0, axis=1, keepdims=True)
 
 
 def preconditioner(e: Equations, K: Tangent) -> Callable[[jax.Array], jax.Array]:
-    """Preconditioner as a function of flat vectors (3 V,): inverse diagonal blocks plus the coarse solution."""
+    """Return the preconditioner, a function of flat vectors: inverse diagonal blocks plus the coarse solution."""
     return in_directions_at(e, K.x, lambda e: _with_pressures(e, K, _motions(e, K)))
 
 
 def _motions(e: Equations, K: Tangent) -> Callable:
-    """Preconditioner of the displacements, as a function of columns (V,)."""
+    """Return the preconditioner of the displacements, as a function of columns (V,)."""
     mesh = e.mesh
     vertices = _groups_in_use(e, mesh.pattern.clusters)
     nodes = vertices if mesh.order == 1 else _groups_in_use(e, mesh.clusters)
@@ -367,8 +368,8 @@ def _motions(e: Equations, K: Tangent) -> Callable:
 
 
 def _with_pressures(e: Equations, K: Tangent, motions: Callable) -> Callable[[jax.Array], jax.Array]:
-    """Preconditioner as a function of flat vectors, made from `motions`, the preconditioner of the displacements for
-    columns (V,). If pressures are unknowns, the flat vectors contain them."""
+    """Return the preconditioner as a function of flat vectors. If pressures are unknowns, the vectors contain them.
+    `motions` is the preconditioner of the displacements, a function of columns (V,)."""
     if e.mixed is None:
         return lambda r: flat_free(e, motions(block_matrix.columns(r)))
     volume, n = e.mixed, 3 * e.mesh.number_of_nodes

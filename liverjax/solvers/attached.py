@@ -27,7 +27,7 @@ class GivesWay(NamedTuple):
 
 
 class Masses(NamedTuple):
-    """For each element: the consistent minus the lumped mass matrix, or this difference times k/dt^2.
+    """Consistent minus lumped mass matrix of each element, or this difference times k/dt^2.
 
     The difference times k/dt^2 is a term of the effective stiffness of a time step dt. The number k depends on the time
     integration (see `liverjax.physics.inertia`). n is the number of nodes of an element.
@@ -60,7 +60,7 @@ def _shared(A: Masses, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
 
 
 def product(A: Between, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
-    """Product of A and a nodal motion, which is given by its columns (V,): nodal forces as columns (V,)."""
+    """Multiply A by a nodal motion, given by its columns (V,). Return the nodal forces as columns (V,)."""
     if isinstance(A, Masses):
         return _shared(A, columns)
     if isinstance(A, GivesWay):
@@ -73,7 +73,7 @@ def product(A: Between, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
 
 
 def own_diagonal(A: Attached, number_of_nodes: int) -> Block:
-    """Diagonal blocks of A at the nodes: 3 x 3 arrays (V,)."""
+    """Return the diagonal blocks of A at the nodes: 3 x 3 arrays (V,)."""
     # If an element contains the same node twice, the block between its two entries is also on the diagonal.
     same = A.nodes[:, None] == A.nodes[None]
     own = jnp.sum(jnp.where(same[:, None, :, None], A.blocks, 0.0), axis=2)  # (n, 3, 3, m)

@@ -17,7 +17,7 @@ def one_blas_thread() -> AbstractContextManager:
 
 @cache
 def _libraries() -> ThreadpoolController:
-    """The loaded BLAS libraries. `scipy.linalg` is imported because it loads a separate BLAS library."""
+    """Return the loaded BLAS libraries. `scipy.linalg` is imported because it loads a separate BLAS library."""
     import scipy.linalg  # noqa: F401
 
     return ThreadpoolController()

@@ -63,7 +63,7 @@ def off_diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Block]) -> Block:
 
 
 def row_sums(rows: Block) -> Block:
-    """Sums of the blocks over the neighbours of each node: m x m arrays (V,)."""
+    """Return the sums of the blocks over the neighbours of each node: m x m arrays (V,)."""
     return tuple(tuple(jnp.sum(entry, axis=0) for entry in row) for row in rows)
 
 
@@ -82,7 +82,7 @@ def force_matrix(mesh: TetMesh, blocks: dict[tuple[int, int], Block], own: Block
 
 
 def added(a: Block, b: Block) -> Block:
-    """Sum of two blocks. An entry that is None counts as 0."""
+    """Return the sum of two blocks. An entry that is None counts as 0."""
 
     def plus(x: Number, y: Number) -> Number:
         return y if x is None else x if y is None else x + y
@@ -91,7 +91,7 @@ def added(a: Block, b: Block) -> Block:
 
 
 def inverse_blocks(diagonal: Block, mask: jax.Array, normals: jax.Array | None = None) -> Block:
-    """Invert the 3 x 3 diagonal blocks. In directions with `mask` (V, 3) equal to 0, rows are those of the unit matrix.
+    """Invert the 3 x 3 diagonal blocks. Where `mask` (V, 3) is 0, rows and columns are as in the identity matrix.
 
     If a block is not positive definite, the mean of the absolute values on its diagonal is inverted instead. `normals`
     (V, 3) are unit vectors or 0. Nodes do not move along their normals. So the coupling of a block with the normal
@@ -130,7 +130,7 @@ def applied(blocks: Block, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...
 
 
 def product(A: BlockMatrix, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
-    """Product A v as m columns (V,), for v with k columns (V,). Only the first k columns of the blocks are used."""
+    """Return A v as m columns (V,), for v with k columns (V,). Only the first k columns of the blocks are used."""
 
     def add(slot, total):
         near = [taken(column, A.nodes[slot]) for column in columns]
@@ -145,15 +145,15 @@ def _row(entries: Any, columns: Sequence[jax.Array]) -> jax.Array:
 
 
 def sums(a: Sequence[jax.Array], b: Iterable[jax.Array]) -> tuple[jax.Array, ...]:
-    """Sum of two nodal vectors, each given by its columns (V,)."""
+    """Return the sum of two nodal vectors, each given by its columns (V,)."""
     return tuple(x + y for x, y in zip(a, b, strict=True))
 
 
 def columns(vector: jax.Array) -> tuple[jax.Array, ...]:
-    """Columns x, y and z (V,) of a flat vector (3 V,), which contains first all x, then all y, then all z."""
+    """Return the columns x, y and z (V,) of a flat vector (3 V,): first all x, then all y, then all z."""
     return tuple(vector.reshape(3, -1))
 
 
 def flat(field: jax.Array) -> jax.Array:
-    """Flat vector (3 V,) of a field (V, 3): first all x, then all y, then all z."""
+    """Return the flat vector (3 V,) of a field (V, 3): first all x, then all y, then all z."""
     return field.T.ravel()

@@ -75,7 +75,7 @@ def smoothed(clusters: Clusters | None, A: Inverses, columns: Sequence[jax.Array
 
 
 def of_rows(clusters: Clusters | None, edge_slots: jax.Array, A: BlockMatrix) -> jax.Array | None:
-    """Blocks (n, 3, 3) of the matrix A of the vertices: one for each of the n entries of `clusters.sources`."""
+    """Return blocks (n, 3, 3) of the matrix A of the vertices, one for each of the n entries of `clusters.sources`."""
     if clusters is None:
         return None
     slots = taken(edge_slots, clusters.sources[0])
@@ -84,7 +84,7 @@ def of_rows(clusters: Clusters | None, edge_slots: jax.Array, A: BlockMatrix) ->
 
 
 def of_points(clusters: Clusters | None, order: int, A: PointMatrix) -> jax.Array | None:
-    """Blocks (n, 3, 3) of the matrix between two shape functions a and b, for the n entries of `clusters.sources`.
+    """Return blocks (n, 3, 3) of A between two shape functions a and b, for the n entries of `clusters.sources`.
 
     A block is the sum of c_ak K_kl c_bl over the integration points of the element and over k, l = 1, 2, 3. c_ak is the
     derivative of function a with respect to the barycentric coordinate k, minus its derivative with respect to

@@ -76,7 +76,7 @@ def _filled(blocks: Block, like: jax.Array) -> jax.Array:
 
 
 def across(normals: np.ndarray, size: int) -> "scipy.sparse.csr_array":
-    """Matrix (size, size) with the 3 x 3 block n n^T of every node (unit normal n), in the order of the unknowns."""
+    """Return the matrix (size, size) of the blocks n n^T of all nodes (unit normal n), in the order of the unknowns."""
     import scipy.sparse  # its import takes a fifth of the package's import time, so it is imported only where needed
 
     number, own = len(normals), np.arange(len(normals))
@@ -195,10 +195,10 @@ class _Factor(NamedTuple):
 
 
 def _factorised(A: "scipy.sparse.csr_array", free: np.ndarray, along: tuple, ways: tuple) -> _Factor:
-    """Factorise A - H S^-1 H^T without the unknowns for which `free` (n,) is 0. `ways`: H and the diagonal of S.
+    """Factorise A without the unknowns for which `free` (n,) is 0. The matrix of the system is A - H S^-1 H^T.
 
-    `along` contains the normals (or None) and a stiffness. The solution is 0 along the normals, and the stiffness
-    replaces the entries of A in these directions.
+    `ways` contains H and the diagonal of S, which `_solution` uses. `along` contains the normals (or None) and a
+    stiffness. The solution is 0 along the normals, and the stiffness replaces the entries of A in these directions.
     """
     import scipy.sparse.linalg
 
@@ -235,8 +235,8 @@ def _solution(own: _Factor, b: np.ndarray) -> np.ndarray:
     return x
 
 
-#: The last matrix, as copies of its arrays, and its factor. The columns of a Jacobian have the same matrix, and vmap
-#: solves them one after another.
+#: The last matrix, as copies of its arrays, and its factor. For the columns of a Jacobian, vmap calls the solver
+#: repeatedly with the same matrix.
 _last: list[tuple[list[np.ndarray], object, _Factor]] = []
 
 

@@ -130,8 +130,8 @@ def stabilised_biconjugate_gradients(
 
 
 #: EARLIER: number of earlier solves that are kept to compute the starting vector of a solve. _NEW: an earlier
-#: right-hand side is ignored if a combination of newer ones represents it with a relative error below _NEW. The
-#: solutions are not more accurate than this.
+#: right-hand side is ignored if a linear combination of newer right-hand sides represents it with a relative error
+#: below _NEW. The solutions are not more accurate than this.
 EARLIER, _NEW = 6, 1e-7
 
 
@@ -142,8 +142,8 @@ class Earlier(NamedTuple):
     solutions: jax.Array  # (EARLIER, m), m entries each
 
     def combined(self, b: jax.Array) -> jax.Array:
-        """Linear combination (m,) of the earlier solutions. The same combination of right-hand sides is as close as
-        possible to b (n,).
+        """Return a linear combination (m,) of the earlier solutions. The same combination of the right-hand sides is as
+        close as possible to b (n,).
 
         The method is Gram-Schmidt orthogonalisation of the right-hand sides, applied twice.
         """
@@ -193,8 +193,8 @@ def symmetric_solve(
     Args:
         matvec: function (x, earlier) -> (A x, the same earlier).
         both: b, and the earlier solves that give the starting vector.
-        solver: function (b, earlier) -> solution, right-hand side, and the norm of the true residual divided by that of
-            the right-hand side. The right-hand side is b, or what remains of b after the elimination of unknowns.
+        solver: function (b, earlier) -> solution, right-hand side, and the true residual (its norm, divided by the norm
+            of the right-hand side). The right-hand side is b, or what remains of b after the elimination of unknowns.
         tolerance: tolerance of the solver.
     """
     # All arrays are joined to one vector, because JAX raises an error if some of the arrays have no cotangents.
@@ -237,7 +237,7 @@ def started(
 
 
 def true_residual(matvec: Callable[[jax.Array], jax.Array], b: jax.Array, x: jax.Array) -> jax.Array:
-    """Relative residual |b - A x| / |b|."""
+    """Return the relative residual |b - A x| / |b|."""
     scale = jnp.linalg.norm(b)
     return jnp.linalg.norm(b - matvec(x)) / jnp.where(scale > 0, scale, 1.0)
 
@@ -285,7 +285,7 @@ def differentiable_solve(
 
 
 def one_by_one(function: Callable) -> Callable:
-    """Return the same function of arrays. On a CPU, `jax.vmap` computes the members of a batch one after another.
+    """Return an equivalent function. On a CPU, `jax.vmap` of it computes the members of a batch one after another.
 
     Otherwise all members would wait for the member with the most iterations, and products of several small matrices
     are slow on a CPU. `jax.custom_batching.sequential_vmap` is not used because it fails in second derivatives.

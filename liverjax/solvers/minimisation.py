@@ -1,7 +1,7 @@
 """Minimise the energy of a step, if elements are inverted at its beginning or if the usual Newton iterations fail.
 
-The usual Newton iterations are those of `liverjax.solvers.step_cutting`. The minimisation uses the true tangent if
-conjugate gradients find no negative curvature in it. Otherwise it uses a tangent without negative eigenvalues
+`liverjax.solvers.step_cutting` does the usual Newton iterations. The minimisation uses the true tangent if conjugate
+gradients find no negative curvature in it. Otherwise it uses a tangent without negative eigenvalues
 (`liverjax.elements.projection`). A backtracking line search halves the step length until the energy decreases enough
 (Armijo's condition). Near the minimum the convergence is quadratic. If elements are inverted at the start, a
 minimisation with a stable neo-Hookean law of the same moduli first removes the inversions. The energy of this law is
@@ -37,8 +37,8 @@ _MOST_ITERATIONS, _MOST_SHORTENINGS = 300, 30
 #: A true tangent that is not symmetric, or has pressures, is used only if the relative residual is below this value.
 #: Far from the solution the tangent may be indefinite. BiCGSTAB does not detect this and would use all its iterations.
 _NEAR = 0.1
-#: Maximum tolerance of the linear solves if pressures follow from positions. It is small, because the ratio of bulk to
-#: shear modulus amplifies errors of the pressure equations.
+#: Maximum tolerance of the linear solves if pressures follow from positions and a solve does not eliminate them. It is
+#: small, because the ratio of bulk to shear modulus amplifies errors of the pressure equations.
 _WITH_PRESSURES = 1e-6
 #: Tolerance of the minimisation that removes inversions with a surrogate law.
 _UNTANGLED = 1e-4

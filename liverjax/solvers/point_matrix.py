@@ -27,8 +27,8 @@ from liverjax.tensors.places import given
 
 
 class PointMatrix(NamedTuple):
-    """Matrix of the linearised equations: the stiffness of the nodal forces and, if pressures are unknowns, the
-    derivatives of the volumes with respect to positions, and the block of the vertex pressures.
+    """Matrix of the linearised equations: the stiffness of the nodal forces and, if the vertices have pressures, the
+    derivatives of the volumes with respect to positions, and the block of these pressures.
 
     Each of E elements has Q integration points.
     """
@@ -47,7 +47,7 @@ class Levels(NamedTuple):
 
 
 def product(mesh: TetMesh, A: PointMatrix, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
-    """Nodal forces, as columns (V,), due to a motion with columns (V,) at constant pressures."""
+    """Return the nodal forces, as columns (V,), due to a motion with columns (V,) at constant pressures."""
     moved = stored(mesh.edges(columns))
     forces = [_force(A.blocks, k, moved) for k in (1, 2, 3)]
     result = mesh.spread(forces)
@@ -65,14 +65,14 @@ def _force(blocks: dict[tuple[int, int], Matrix], k: int, moved: list[Vector]) -
 
 
 def volume_changes(mesh: TetMesh, A: PointMatrix, columns: Sequence[jax.Array]) -> jax.Array:
-    """Change (V,) [m^3] of the volumes that belong to the vertices, for a motion with columns (V,)."""
+    """Return the change (V,) [m^3] of the volumes that belong to the vertices, for a motion with columns (V,)."""
     assert A.border is not None
     moved = stored(mesh.edges(columns))
     return gathered(mesh, sum(dot(g, d) for g, d in zip(A.border, moved, strict=True)))
 
 
 def pull(mesh: TetMesh, A: PointMatrix, pressures: jax.Array) -> tuple[jax.Array, ...]:
-    """Nodal forces, as columns (V,), due to vertex pressures (V,) [Pa]: the transpose of `volume_changes`."""
+    """Return nodal forces, as columns (V,), due to vertex pressures (V,) [Pa]: the transpose of `volume_changes`."""
     assert A.border is not None
     p = interpolated(mesh, pressures)
     return tuple(mesh.spread([tuple(p * g for g in border) for border in A.border]))
@@ -101,7 +101,7 @@ def levels(mesh: TetMesh, A: PointMatrix, bulk: Number | None = None) -> Levels:
 
 
 def _diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Matrix]) -> Block:
-    """Diagonal blocks of the matrix with the given blocks at the integration points: 3 x 3 arrays (V,).
+    """Return the diagonal blocks of the matrix with the given blocks at the integration points: 3 x 3 arrays (V,).
 
     The block of node a is the sum of c_ak K_kl c_al over elements, integration points and k, l = 1, 2, 3. K_kl are the
     given blocks. c_ak is the derivative of shape function a with respect to the barycentric coordinate k, minus its
@@ -136,7 +136,7 @@ def restricted(mesh: TetMesh, column: jax.Array) -> jax.Array:
 
 
 def prolonged(mesh: TetMesh, column: jax.Array) -> jax.Array:
-    """Values at all nodes of a field that is linear in every element, from its values at the vertices (V,)."""
+    """Map values at the vertices (V,) to all nodes, for a field that is linear in every element."""
     nodes = on_middles(mesh, column)
     more = mesh.number_of_nodes - len(nodes)
     return nodes if more == 0 else jnp.concatenate([nodes, jnp.zeros(more, column.dtype)])

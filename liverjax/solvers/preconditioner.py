@@ -49,7 +49,7 @@ def coarse(mesh: TetMesh, A: BlockMatrix, mask: jax.Array, used: Number) -> Coar
 
 
 def _inverse(E: jax.Array) -> jax.Array:
-    """Inverse of a coarse matrix; 0 if the matrix is not positive definite."""
+    """Return the inverse of a coarse matrix; 0 if the matrix is not positive definite."""
     d = jnp.diagonal(E)
     # In a patch that is flat or has no free nodes along an axis, some coarse motions are 0. The added diagonal
     # excludes these motions.
@@ -75,7 +75,7 @@ def coarse_of_product(mesh: TetMesh, product: Callable[[jax.Array], jax.Array]) 
 
 
 def worthwhile(A: BlockMatrix, inertia: Any) -> jax.Array:
-    """Whether the coarse space saves time: true if `inertia` is on average below 1/30 of the diagonal of A."""
+    """Return whether the coarse space saves time: if `inertia` is on average below 1/30 of the diagonal of A."""
     if inertia is None:
         return jnp.array(True)
     total = sum(jnp.sum(A.diagonal[r][r]) for r in range(3)) / 3
@@ -111,7 +111,7 @@ def corrected(
 
 
 def _galerkin(mesh: TetMesh, A: BlockMatrix, f: jax.Array, mask: jax.Array, number: int) -> jax.Array:
-    """Coarse matrix Z^T A Z (4 m P, 4 m P) for P patches with the coarse motions Z, with m components per node.
+    """Return the coarse matrix Z^T A Z (4 m P, 4 m P) for the coarse motions Z of P patches, m components per node.
 
     The matrix is a sum over the edges, plus the transpose of this sum, plus a sum over the diagonal blocks of A.
     """

@@ -1,7 +1,7 @@
 """Input and output of the solvers of a step: the equations, limits, the tangent of an earlier step, and statistics.
 
-q (n,) is the flat vector of unknowns. s is the fraction of the step: the loads are those at its beginning for s = 0,
-and those at its end for s = 1. r(q, s) is the residual.
+q (n,) is the flat vector of unknowns. s is the fraction of the step: the loads have their values at the beginning of
+the step for s = 0, and their values at the end for s = 1. r(q, s) is the residual.
 """
 
 from collections.abc import Callable
@@ -46,9 +46,9 @@ class Kept(NamedTuple):
     tangent: Any
     made: jax.Array  # False if there is no tangent yet
     pace: jax.Array  # linear iterations per digit of accuracy when the preconditioner was new
-    worn: jax.Array  # whether the preconditioner now needs many more iterations
-    #: `surprise`: the last root minus its prediction. `trust`: the factor (0 to 1) that brings the surprise of the step
-    #: before closest to this vector. The next guess is the prediction plus `trust` times `surprise`.
+    worn: jax.Array  # whether the preconditioner needs many more iterations than when it was new
+    #: `surprise`: the last root minus its prediction. `trust`: a factor from 0 to 1, with which the surprise of the
+    #: previous step was closest to `surprise`. The next guess is the prediction plus `trust` times `surprise`.
     surprise: jax.Array
     trust: jax.Array
     beside: jax.Array | None = None  # the additional unknowns at the root (`Problem.beside`)
@@ -90,7 +90,7 @@ class Problem(NamedTuple):
     preconditioner: Callable[[Any], Callable[[jax.Array], jax.Array]]
     #: Function for derivatives if dr/dq is symmetric: (tangent, b, tolerance, max_iterations, earlier solves) -> the
     #: solution with the exact dr/dq, the right-hand side, and the residual divided by the norm of the right-hand side.
-    #: If there are additional unknowns (`beside`), b and the solution contain them as well as q. The right-hand side is
+    #: If there are additional unknowns (`beside`), b and the solution include them. The right-hand side is
     #: then what remains of b after the elimination of the additional unknowns; otherwise it is b. None: derivatives use
     #: products with dr/dq.
     adjoint: Callable[[Any, jax.Array, Number, int, Earlier], tuple[jax.Array, jax.Array, jax.Array]] | None = None
@@ -124,12 +124,12 @@ class Potential(NamedTuple):
     #: The problem of the body with another law, with a finite energy in inverted elements. None if the law of the body
     #: already has such an energy.
     surrogate: Problem | None
-    #: A pair: unknowns of the reference shape, and whether the start of the step is only a guess. If it is a guess, the
-    #: solution is followed from the reference shape. None: the start is never a guess.
+    #: A pair: unknowns of the reference shape, and whether the unknowns at the beginning of the step are only a guess.
+    #: If the guess fails, the solution is followed from the reference shape. None: the step never begins at a guess.
     rest: tuple[jax.Array, jax.Array] | None
     #: Function q -> q with the optimal pressures for its positions; None if pressures are not unknowns.
     settled: Callable[[jax.Array], jax.Array] | None = None
     #: Number of unknowns that are positions; None: all unknowns are positions.
     positions: int | None = None
-    #: Whether a solve with a definite tangent eliminates the pressures. Such a solve needs no stricter tolerance.
+    #: Whether a solve with a definite tangent eliminates the pressures. Such a solve needs only the usual tolerance.
     eliminates: bool = False

@@ -38,7 +38,8 @@ _PRECISIONS, ROUNDINGS = 4096, 8
 #: this number of times per substep. The tangent is different beyond a kink.
 _LEAPS = 8
 
-#: A guess is not used if the volume ratio of any element is below this value. Such a guess may lead to a folded shape.
+#: Without inertia, a guess is not used if the volume ratio of any element is below this value (robust steps only). Such
+#: a guess may lead to a folded shape.
 _FLAT = 0.1
 
 #: Maximum tolerance of the linear solve if a step consists of only one solve.
@@ -143,8 +144,8 @@ def solve(
         guessing = jnp.array(guess is not None)
         return _follow(problem, start, start if guess is None else guess, guessing, kept, options)
 
-    # There are two derivative rules: the search has no derivative, and the derivative of the root uses the tangent at
-    # the root. For the first rule, any function with a constant root is enough.
+    # There are two derivative rules. The search has no derivative, so any function is good enough for its rule. The
+    # derivative of the root uses the tangent at the root.
     if options.differentiable:
         found_by = jax.lax.custom_root(lambda q: q, start, follow, lambda _, y: jnp.zeros_like(y), has_aux=True)
     else:
@@ -225,7 +226,7 @@ def _guarded(problem: Problem, q: jax.Array) -> jax.Array:
 
 
 def _evaluated_near(problem: Problem, q: jax.Array, s: jax.Array, beside: jax.Array | None, looser: Number) -> tuple:
-    """Residual at q. The solve for the additional unknowns begins with `beside`, their values at a nearby q."""
+    """Evaluate the residual at q. The solve for the other unknowns begins at `beside`, their values at a nearby q."""
     if problem.beside is None or beside is None:
         return problem.residual(q, s)
     return problem.residual(q, s, problem.beside.guess(beside, looser))
@@ -269,8 +270,8 @@ def _robust(
 ) -> tuple[jax.Array, jax.Array]:
     """Follow the solution along the load. Minimise the energy if this fails or if elements are inverted at `start`.
 
-    Without inertia, a start that differs from the reference shape is only a guess. If an element of the guess is nearly
-    flat, or if the guess leads to no solution, the solution is followed from the reference shape.
+    In the first step of a static run, a `start` that differs from the reference shape is only a guess. If an element of
+    the guess is nearly flat, or if the guess leads to no solution, the solution is followed from the reference shape.
     """
     zero = jnp.zeros((), start.dtype)
     nothing = StepStatistics(zero + status.STALLED, zero, zero, zero, zero)
@@ -468,7 +469,7 @@ def _looser(options: StepOptions, v: _Verdict, expected: jax.Array, before: jax.
 
 
 def _along(problem: Problem, q: jax.Array, s: jax.Array) -> jax.Array:
-    """Derivative dr/ds of the residual with respect to the load fraction s, due to loads and prescribed motions."""
+    """Return the derivative dr/ds of the residual with respect to the load fraction s (loads, prescribed motions)."""
     return jax.jvp(lambda s: problem.residual(q, s)[0], (s,), (jnp.ones_like(s),))[1]
 
 

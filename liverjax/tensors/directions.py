@@ -10,7 +10,7 @@ from liverjax.tensors.matrices import IDENTITY, Matrix, Vector, add, cross, dot,
 def components(direction: Numbers | None, like: Number) -> Vector:
     """Normalise a direction (3,), or one direction per element (E, 3), and return its three components.
 
-    The precision (number of bits) is that of `like`. If `like` is an array, its last axis has one entry per element.
+    The result has the precision of `like`. If `like` is an array, its last axis has one entry per element.
     """
     direction = jnp.asarray(direction, jnp.result_type(like))
     shape, elements = direction.shape, jnp.shape(like)

@@ -1,6 +1,6 @@
 """Deformation gradients and invariants. Every component is an array over the elements.
 
-A vector is a tuple of three arrays (E,). A matrix is a tuple of three such rows (here: tuple matrix). In this form XLA
+A vector is a tuple of three arrays (E,). A matrix is a tuple of three such rows (a "tuple matrix"). In this form XLA
 vectorises over the elements. XLA does not vectorise batched products of arrays (E, 3, 3).
 """
 
@@ -19,7 +19,7 @@ IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class Invariants(NamedTuple):
-    """Strain measures (E,) on which a strain energy depends. A measure that the law does not use is None."""
+    """Strain measures (E,) on which a strain energy depends. A measure is None if the law does not use it."""
 
     I1: Any = None  # tr C
     I2: Any = None  # (I1^2 - tr C^2) / 2

@@ -1,7 +1,7 @@
 """Principal stretches and sums of their powers, with derivatives that also exist if stretches are equal.
 
 With the principal stretches lambda_m, the sum Xi(alpha) = sum_m lambda_m^alpha = tr C^(alpha/2) is a smooth function of
-C, although the eigenvectors of C are not. So the eigenvectors are constant in derivatives. In the axes of the
+C, although the eigenvectors of C are not. So derivatives treat the eigenvectors as constants. In the axes of the
 eigenvectors, C = diag(c) + X. The value of X is zero, but its derivatives are not. Then
 
     tr C^q = sum f(c_i) + sum g[c_i] X_ii + 1/2 sum g[c_i, c_j] X_ij^2 + 1/3 sum g[c_i, c_j, c_k] X_ij X_jk X_ki
@@ -27,7 +27,7 @@ SWEEPS = 5
 
 
 class Stretches(NamedTuple):
-    """Principal stretches of F. In derivatives, `logs` are constant. `change` and `log_J` have derivatives."""
+    """Principal stretches of F. Derivatives treat `logs` as constants, but not `change` and `log_J`."""
 
     logs: Vector  # ln lambda_m
     change: tuple  # X of the module docstring: the result of the function `change`, in principal axes
@@ -206,7 +206,7 @@ def divided_difference(p: Number, *logs: Number) -> jax.Array:
 def _divided_power(p: Any, y: list) -> Number:
     """Return the divided difference of (1 + c)^p at the three values c in y, with |c| < 0.11.
 
-    It is computed by the binomial series of the power, truncated at 0.11^16 = 5e-16.
+    It is computed with the binomial series of the power. The neglected terms are of the order 0.11^16 = 5e-16.
     """
     # complete homogeneous symmetric polynomials h_k of y
     homogeneous = [jnp.ones_like(y[0]), *[jnp.zeros_like(y[0])] * 15]

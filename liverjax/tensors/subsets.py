@@ -62,7 +62,7 @@ def in_subset(s: Subsets, k: int, numbers: T) -> T:
 
 
 def put_together(s: Subsets, numbers: Sequence[T]) -> T:
-    """Join the pytrees of all subsets to one pytree with values of all elements.
+    """Join the pytrees of all subsets into one pytree with the values of all elements.
 
     The pytrees have the same structure, and contain arrays (…, n) for the n elements of their subset.
     """

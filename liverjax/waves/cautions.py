@@ -55,7 +55,7 @@ def _of_short_waves(scene: Scene, hertz: float) -> list[str]:
         return []
     try:
         shear = float(np.median(np.asarray(scene.law.shear_modulus())))
-    except InputError:  # some laws state no shear modulus
+    except InputError:  # a law may have no moduli
         return []
     low, high = np.asarray(scene.mesh.points)[np.asarray(scene.mesh.pattern.edges)]
     edge = float(np.median(np.linalg.norm(high - low, axis=1)))

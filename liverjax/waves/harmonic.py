@@ -72,16 +72,17 @@ def harmonic(
 ) -> Harmonic:
     """Compute the small harmonic motion that is caused by the tractions, prescribed motions and inlets of the scene.
 
-    The values of these loads are amplitudes. Law, viscosity, porosity, density, gravity, supports, fixed nodes and
-    regions are included. Time steps and histories have no effect. An obstacle stays at its position at time 0. The
-    function works inside jit and in both modes of differentiation. A derivative needs one more solve per frequency.
+    The values of these loads are amplitudes. The equations include law, viscosity, porosity, density, gravity,
+    supports, fixed nodes and regions. Time steps and histories have no effect. An obstacle stays at its position at
+    time 0. The function works inside jit and in both modes of differentiation. A derivative needs one more solve per
+    frequency.
 
     Args:
         scene: `Scene`. The motion of `displaced` is an amplitude with phase 0.
         frequencies_Hz: F frequencies (F,), above 0; default: the frequencies of scene.solve.
         factors: complex factors G*/G0 that multiply the relaxing part of the stress, (F,), or (F, E) with one value for
             each element. Default: 1 - sum g_k/(1 + i omega tau_k) with the ratios g_k and relaxation times tau_k of the
-            scene's Prony series, or the factor of its springpots; 1 without viscosity. Nodal pressures (volumetric
+            scene's Prony series, or the factors of its springpots; 1 without viscosity. Nodal pressures (volumetric
             "mixed" or "nodal", or a porous body) do not relax.
         about: positions (V, 3) [m] about which the body vibrates: an equilibrium after a long time, for example from
             `simulate`. The stress in this state changes the stiffness; the fluid pressure is 0. Default: the state of
@@ -89,15 +90,14 @@ def harmonic(
             is not done and the reference shape is used. If the components of gravity are JAX tracers (inside jit, grad
             or vmap), the run is always done.
         motion: complex amplitudes (V, 3) or (F, V, 3) [m] that replace the prescribed motion of the scene.
-        mass: "consistent" (mass matrix of each element), or "lumped" as in transient runs.
+        mass: "consistent" (mass matrix of each element), or "lumped". `[body] mass` has no effect.
 
     Returns:
         `Harmonic`. The result is NaN at a frequency with a singular matrix.
 
     Raises:
-        InputError: the scene contains something that is not implemented for harmonic motion (for example a pressure
-            that follows the surface, friction, or a rigid plate); shapes or values cannot be used; there is no state of
-            rest under gravity.
+        InputError: the scene contains what harmonic motion cannot have (for example a pressure that follows the
+            surface, friction, or a rigid plate); wrong shapes or values; too little memory; no state of rest.
     """
     weighed = scene
     omegas = 2 * jnp.pi * _frequencies(scene.solve.frequencies if frequencies_Hz is None else frequencies_Hz)
@@ -243,7 +243,7 @@ _NODES, _TEMPORARY = (4, 10, 20), (4, 6, 6)
 
 
 def _check_memory(mesh: TetMesh) -> None:
-    """Raise InputError if the element matrices need more memory than the processor has left. Without this check, the
+    """Raise InputError if the element matrices need more memory than the computer has left. Without this check, the
     operating system would end the program without a message."""
     if jax.default_backend() != "cpu":
         return

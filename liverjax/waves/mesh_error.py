@@ -118,7 +118,7 @@ def _on_nodes(mesh: TetMesh, rich: TetMesh, within: Within | None, forces: jax.A
 
 
 def _padded(rich: TetMesh, within: Within | None, x: jax.Array) -> jax.Array:
-    """Return the nodal field x (…, V, 3) of the original mesh, interpolated to the nodes of the mesh `rich`."""
+    """Return the coefficients, on the mesh `rich`, of the nodal field x (…, V, 3) of the original mesh."""
     if within is not None:
         return jnp.moveaxis(within.field(jnp.moveaxis(x, -2, 0)), 0, -2)
     if rich.order == 2:

@@ -61,7 +61,7 @@ def operator(e: Equations, x: jax.Array, loaded: bool, mass: str) -> Operator:
         e: equations of the scene without its viscosity.
         x: positions (V, 3) [m].
         loaded: whether x differs from the reference shape. Then the stress at x changes the stiffness.
-        mass: "consistent", or "lumped" as in transient runs.
+        mass: "consistent", or "lumped".
     """
     scene, mesh, F = e.scene, e.mesh, deformation_gradient(e.mesh, x)
     volume, pressures = scalars_and_pressures(scene, x, F)

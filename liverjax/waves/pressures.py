@@ -11,7 +11,7 @@ storage and flow, and the inflow `enters`.
 In a porous body (`liverjax.physics.porosity`), B^T u is minus the change of the volumes at the vertices. The second
 equation is then Darcy's law divided by i omega. The law is (1/K_lim) i omega p = kappa lap p - i omega (dJ/J), with the
 Laplacian lap p of the pressure, the volume ratio J, the bulk modulus K_lim of the storage and the permeability kappa.
-Volumes are those of the state about which the body moves. With averaged or mixed volumes (`liverjax.physics.volumes`),
+Volumes refer to the state about which the body moves. With averaged or mixed volumes (`liverjax.physics.volumes`),
 p is positive in tension and B^T u is the change of the volumes. Nothing flows, and `store` is the volumetric
 compliance.
 """
@@ -49,8 +49,8 @@ class Pressures(NamedTuple):
 
 
 def law_beside(scene: Scene) -> Any:
-    """Return the law without its volumetric energy if unknown pressures replace this energy; otherwise return the
-    law."""
+    """Return the law without its volumetric energy if unknown pressures or the porous body replace this energy;
+    otherwise return the law."""
     if scene.solve.volumetric in ("nodal", "mixed"):
         return isochoric_part(scene.law)
     return law_in_force(scene.porosity, scene.law)

@@ -280,7 +280,7 @@ def _has_to_be_small(
 
 
 def _keep(key: bytes, factor: multifrontal.Factor) -> None:
-    """Keep a factor if all factors need less than `KEPT` bytes. Factors of other matrices are deleted."""
+    """Delete the factors of other matrices. Keep this factor if all factors together need less than `KEPT` bytes."""
     for other in [other for other in _factors if other[:16] != key[:16]]:
         del _factors[other]
     if factor.nbytes + sum(own.nbytes for own in _factors.values()) < KEPT:

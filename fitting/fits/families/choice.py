@@ -1,8 +1,8 @@
 """The choice between models of several families by their information criteria.
 
-If one model contains another, the general model always fits the data at least as closely. The general model is chosen
-only if the criterion is strong evidence for it (Kass and Raftery 1995, J. Am. Stat. Assoc. 90). If the data do not need
-the general model, its predictions outside the measured band are worse.
+A general model may contain a special case: for some values of its parameters, it equals the special case. It then fits
+the data at least as closely. It is chosen only if the criterion is strong evidence for it (Kass and Raftery 1995, J.
+Am. Stat. Assoc. 90). If the data do not need the general model, its predictions outside the measured band are worse.
 """
 
 from collections.abc import Sequence
@@ -44,8 +44,8 @@ def contains(general: Label, special: Label) -> bool:
 
 
 def preferred(labels: Sequence[Label], criteria: Sequence[float]) -> int:
-    """Return the index of the model with the lowest criterion. A model can be chosen only if its criterion is lower by
-    `GENERAL` than the criteria of its special cases."""
+    """Return the index of the model with the lowest criterion. A model can be chosen only if its criterion is lower, by
+    at least `GENERAL`, than the criterion of each of its special cases."""
     beaten = {
         j
         for j, general in enumerate(labels)

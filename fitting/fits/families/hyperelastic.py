@@ -32,8 +32,8 @@ def candidates(name: str, terms: int | None = None) -> list[Candidate]:
     another number of terms.
 
     Raises:
-        InputError: the law is unknown, its energy is not an isochoric energy plus U(J), or `terms` is given for another
-            law than Ogden's.
+        InputError: the law is unknown, its energy is not an isochoric energy plus a volumetric energy U(J), or `terms`
+            is given for a law other than Ogden's law.
     """
     if terms is not None and name not in ("ogden", "all"):
         raise InputError(f"--terms {terms} cannot be used with {name}, only with ogden: remove --terms")
@@ -87,7 +87,7 @@ def _sum(label: str, parts: list[Candidate]) -> Candidate:
 
 
 def incompressible_form(name: str) -> bool:
-    """Return whether a law is an isochoric energy plus U(J)."""
+    """Return whether the energy of a law is an isochoric energy plus a volumetric energy U(J)."""
     return laws.isochoric_part(laws.typical(name)) is not None
 
 

@@ -11,19 +11,19 @@ from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.uncertainty import NO_REST, equilibrium_error
 
-#: The program warns if a difference exceeds this many standard errors.
+#: The program warns if the difference between two moduli exceeds this many standard errors.
 TOLD = 2.0
 #: Limit for a ratio: the decrease of G' in the lowest half decade of the band, divided by that in the next half decade.
-#: Above this limit, the material may relax much more at lower frequencies. One relaxation time well inside the band
-#: gives 0.1. A modulus that falls by the same amount in each half decade gives 1.
+#: Above this limit, the material may relax much more at lower frequencies. A material with one relaxation time well
+#: inside the band gives 0.1. A modulus that falls by the same amount in each half decade gives 1.
 SLOWING = 0.5
 NAMES = {"shear_modulus": "instantaneous modulus", "equilibrium_modulus": "equilibrium modulus"}
 
 
 def of_the_model(own: Estimate | None) -> dict[str, float]:
     """Return the moduli [Pa] of a model at infinite frequency and at frequency 0. The keys are the names of these
-    moduli in fit.json. Infinite moduli are not included. `own`: parameters of the model; if None (Prony modes), the
-    result is empty."""
+    moduli in fit.json. Infinite moduli, and the equilibrium modulus of a fluid, are not included. `own`: parameters of
+    the model; if None (Prony modes), the result is empty."""
     if own is None:
         return {}
     values = {name: float(value) for name, value in zip(own.names, own.values, strict=True)}
@@ -56,8 +56,8 @@ def limit_errors(modes: Estimate, model: Maxwell, own: Estimate | None) -> dict[
 
 
 def limit_sentences(name: str, modes: Estimate, model: Maxwell, own: Estimate | None) -> list[str]:
-    """Return a warning for frequency 0, for infinite frequency, or for both, if the modulus of the Prony modes there
-    differs from the modulus of the model by more than `TOLD` standard errors of the fit."""
+    """Return warnings about the moduli at frequency 0 and at infinite frequency. There is a warning for each modulus of
+    the Prony modes that differs from the modulus of the model by more than `TOLD` standard errors of the fit."""
     here, alone = of_the_modes(model), limit_errors(modes, model, None)
     out = []
     for limit, there in of_the_model(own).items():

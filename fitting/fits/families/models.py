@@ -142,7 +142,7 @@ def _finished(fit: Fit, made: as_prony_modes.Conversion) -> Fit:
 
 
 def _has_spring(own: Estimate | None) -> bool:
-    """Return whether an exponent of a fractional model is 0. Such a springpot is a spring."""
+    """Return whether an exponent of a fractional model is 0. A springpot with the exponent 0 is a spring."""
     return own is not None and bool(np.any(_bounded(own) & (own.values < 0.5)))
 
 
@@ -249,7 +249,7 @@ def choose(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) -> Fit:
     Args:
         sweep: data.
         model: one of `MODELS` except "prony".
-        prony: the best fit of Prony modes, which is compared too if `model` is "auto".
+        prony: the best fit of Prony modes. If `model` is "auto", this fit is compared too.
         dense: result of `generalised_maxwell.spectrum(sweep)`.
     """
     tried = every_model(sweep, model, prony, dense)
@@ -282,8 +282,8 @@ def _compared(sweep: Sweep, tried: list[Fit]) -> list[Content]:
 
 
 def _rival_models(chosen: Fit, tried: list[Fit], able: list[Fit]) -> list[str]:
-    """Return warnings if another model fits the data about equally well, or if another model fits better but the data
-    do not determine all its parameters."""
+    """Return warnings in two cases: another model fits the data about equally well, or another model fits better but
+    the data do not determine all its parameters."""
     best, out = min(tried, key=information_criterion), []
     if information_criterion(best) < information_criterion(chosen) - STRONG:
         apart = information_criterion(chosen) - information_criterion(best)

@@ -33,8 +33,8 @@ from fitting.readers.frequency_sweep import Sweep
 from fitting.readers.time_tests import TimeTest
 from liverjax.core.struct import Content
 
-#: STARTS: number of starting points for each model. AROUND: standard deviation of the random starting points around the
-#: first one, which comes from Prony modes. MOST_STEPS: maximum number of iterations.
+#: STARTS: number of starting points for each model. The first starting point comes from Prony modes. AROUND: standard
+#: deviation of the other, random starting points around the first. MOST_STEPS: maximum number of iterations.
 STARTS, AROUND, MOST_STEPS = 10, 1.0, 80
 #: An exponent is a logistic function of its variable. If the size of this variable is above MOST_LOGIT, the derivative
 #: is too small for the first step of a search.
@@ -58,8 +58,8 @@ def spans_of(tests: Sequence[Measured]) -> Spans:
 
 
 def _dense_modes(case: Fractional, spans: Spans) -> Callable[[Array], Maxwell]:
-    """Return a function, in NumPy or JAX, from the variables u of the model to the Prony modes of its relaxation
-    spectrum."""
+    """Return a function for NumPy and JAX. It computes many Prony modes, which represent the relaxation spectrum of the
+    model, from the variables u of the model."""
 
     def maxwell(u):
         return springpots.as_modes(springpots.full(case, u), case.switches, spans.times, spans.reference)
@@ -122,7 +122,7 @@ class _Springpot(NamedTuple):
 
 def _springpot_at(case: Fractional, solution: Solution, spans: Spans, over_noise: bool) -> _Springpot:
     """Return a springpot model with its parameters, errors and warnings at the minimum `solution`. `over_noise`:
-    whether the residuals are divided by a known noise, so that no noise is estimated."""
+    whether the residuals are already divided by their noise. If False, the noise is estimated from the residuals."""
 
     def at(u, omega):
         return springpots.moduli(springpots.full(case, u), case.switches, omega / spans.reference)
@@ -154,7 +154,8 @@ def _springpot_at(case: Fractional, solution: Solution, spans: Spans, over_noise
 
 
 def able(fit: TimeFit | Together, data: uncertainty.Band) -> bool:
-    """Return whether the fit converged and the data determine every parameter."""
+    """Return whether the fit converged and the data determine every parameter. For a spectrum, only the convergence is
+    checked, because the spectrum has a prior."""
     if fit.parameters is not None:
         return fit.converged and (fit.kind.effective is not None or bool(np.all(models.determined(fit.parameters))))
     return fit.converged and not uncertainty.superfluous(data, fit.uncertainty)
@@ -294,8 +295,8 @@ def choose_together(
 
 
 def _by_its_noise(test: Measured) -> Measured:
-    """Return the test. For a relaxation or creep test with enough values, `constant_noise` is set to True if its noise
-    has a constant size."""
+    """Return the test. If it is a relaxation or creep test with enough values and with noise of a constant size, its
+    `constant_noise` is set to True."""
     if not isinstance(test, TimeTest) or np.sum(test.used) < _ENOUGH:
         return test
     return fitted_by_its_noise(test)[0]

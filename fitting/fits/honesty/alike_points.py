@@ -19,8 +19,8 @@ from fitting.readers.frequency_sweep import Sweep
 INDEPENDENT = "independent_moduli"
 #: Key in `Fit.details`: the standard errors of the parameters for independent noise, by name.
 OF_INDEPENDENT = "errors_of_independent_noise"
-#: Words about the standard errors in the warning about structured residuals, if the noise of neighbouring frequencies
-#: is correlated.
+#: Words of the warning about structured residuals, if the noise of neighbouring frequencies is correlated. They state
+#: that the standard errors include this noise.
 CONTAINED = "the standard errors contain it, as correlated noise of neighbours"
 #: First words of the warning about noise that is correlated between neighbouring frequencies.
 SHARED = "the noise of neighbouring frequencies is correlated"
@@ -42,7 +42,7 @@ def with_alike_points(fit: Fit, sweep: Sweep) -> Fit:
         f"{alike.independent:.0f} independent moduli; the standard errors include this effect"
     )
     fluid = uncertainty.like_a_fluid(modes, uncertainty.LOWER) if fit.kind.name == "prony" else []
-    # The warning about a fluid may have been given before, with the smaller errors.
+    # The fit may already have the warning about a fluid, which was then given for the smaller errors.
     fluid = [] if any("(a fluid)" in w for w in fit.warnings) else fluid
     details = fit.details | {INDEPENDENT: float(alike.independent)}
     return fit._replace(uncertainty=modes, parameters=own, warnings=(*fit.warnings, *fluid, told), details=details)

@@ -21,11 +21,11 @@ SMOOTH, ENOUGH = 0.5, 16
 
 
 def moved_by_noise(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float]:
-    """Return the standard deviation of the change of each parameter of `edges.values` due to noise alone, if a second
-    fit contains only the points `kept` (n,) of the n points. The result is a first-order estimate.
+    """Return, for each parameter of `edges.values`, the standard deviation of its change due to noise alone. The change
+    is that from `fit` to a second fit of only the points `kept` (n,) of the n points (first-order estimate).
 
-    Both fits contain the kept points. The variance of the change is therefore that of the difference between the two
-    fits, not that of the new fit.
+    Both fits contain the kept points, so their errors are correlated. Therefore the function computes the variance of
+    the difference between the two fits, not the variance of the second fit.
     """
     J, names, slope = np.asarray(fit.solution.jacobian), *_slopes_of_reported(fit)
     points = 2 * len(kept)
@@ -40,8 +40,8 @@ def moved_by_noise(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float]
 
 
 def farthest_by_chance(fit: Fit | TimeFit, numbers: int) -> float:
-    """Return a quantile of Student's t. The largest change at the two ends, divided by its standard deviation, exceeds
-    this quantile due to noise alone in the fraction `CHANCE` of all fits.
+    """Return a quantile of Student's t. Due to noise alone, the largest change at the two ends, divided by its standard
+    deviation, exceeds this quantile in at most the fraction `CHANCE` of all fits.
 
     Args:
         fit: the fit whose residuals give the noise.

@@ -1,5 +1,5 @@
-"""For tests that contradict each other, this module checks whether they agree if all moduli of one test are multiplied
-by one factor.
+"""This module checks whether tests that contradict each other agree after all moduli of one test are multiplied by one
+factor.
 
 Another temperature, a wrong size of the sample or a wrong calibration changes all moduli of a test by the same factor.
 A common fit lies between such tests and fits none of them well. In this module, the factor is one more parameter of the
@@ -54,7 +54,7 @@ def told(fit: Together, relative: float = 0.0) -> list[str]:
 
 def factor_of(fit: Together, k: int) -> tuple[float, float, float] | None:
     """Return the factor [1] of all moduli of test k, its standard error, and the largest remaining relative misfit. The
-    relative misfit of a test is its misfit divided by that of a fit to this test alone.
+    relative misfit of a test is its misfit, divided by the misfit of a fit to this test alone.
 
     Returns None if the factor is 1 within its error, or if the misfit of a test is still large.
     """
@@ -99,8 +99,8 @@ def _certain(found: Solution, counts: list[int]) -> tuple[float, float, float] |
 
 
 def _starts_at_the_others(fit: Together, k: int, modes: int) -> np.ndarray:
-    """Return starting points that fit the other tests. Each starting point contains the factor that shifts the
-    prediction of test k to the measured values. For a large factor, the common fit is not a good starting point.
+    """Return starting points for the modes and the factor. The modes fit the other tests. The factor shifts the
+    prediction of test k to its measured values. For a large factor, the common fit is not a good starting point.
     """
     others = [t for j, t in enumerate(fit.tests) if j != k]
     band = together.ResolvedBand(together.resolved_by(others))

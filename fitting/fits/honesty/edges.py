@@ -16,16 +16,16 @@ from fitting.methods.least_squares import from_starts
 from fitting.readers.rheometer import Sweep, some
 
 HALF_DECADE = float(np.sqrt(10))
-#: KRAMERS_KRONIG: word by which warnings of the Kramers-Kronig check of the data are found. PARTS: names of the two
+#: KRAMERS_KRONIG: words that identify the warnings from the Kramers-Kronig check of the data. PARTS: names of the two
 #: repeated fits in the report.
 KRAMERS_KRONIG = "Kramers-Kronig"
 PARTS = ("without_first_half_decade", "without_last_half_decade")
 
 
 def honest(fit: Fit, sweep: Sweep, dense: Spectrum) -> Fit:
-    """Return the fit with further checks and errors: standard errors for correlated noise, the check of the data by the
-    Kramers-Kronig relations, the check of the residuals for structure, the influence of the ends of the band, and the
-    interval of the equilibrium modulus."""
+    """Return the fit with the results of further checks: standard errors for correlated noise, the check of the data by
+    the Kramers-Kronig relations, the check of the residuals for structure, the influence of the ends of the band, and
+    the interval of the equilibrium modulus."""
     wider = with_alike_points(fit, sweep)
     if wider is not fit:
         own = {name: error for name, (_, error) in values(fit).items()}
@@ -124,9 +124,9 @@ def moved(fit: Fit) -> set[str]:
 
 
 def decided_by(fit: Fit | TimeFit, part: str) -> dict[str, float]:
-    """Return the parameters that change by more than their standard error and by more than expected from noise, if the
-    half decade of `part` (one of `PARTS`) is left out. The keys are the names of the parameters. Each value is the size
-    of the change, divided by the larger of these two limits.
+    """Return the parameters that depend strongly on the half decade of `part` (one of `PARTS`). If this half decade is
+    left out, they change by more than their standard error and by more than expected from noise. The keys are the names
+    of the parameters. Each value is the size of the change, divided by the larger of these two limits.
     """
     changes, known = (fit.details.get("band_sensitivity") or {}).get(part) or {}, values(fit)
     by_noise = (fit.details.get("band_scatter") or {}).get(part) or {}

@@ -1,5 +1,4 @@
-"""Interval of the equilibrium modulus, computed with the possibility that parts of the material relax only after the
-end of the test.
+"""Interval of the equilibrium modulus. It allows for parts of the material that relax only after the end of the test.
 
 The standard error is a linear estimate at the minimum, for the chosen modes. If the relaxation time of a mode is near
 the end of the test or longer, the data hardly distinguish this mode from the equilibrium modulus. So the equilibrium
@@ -52,10 +51,10 @@ class Interval(NamedTuple):
 
 
 class _Family(NamedTuple):
-    """Fits of Prony modes with a fixed equilibrium modulus. The unknowns u of N modes are the logs of their strengths,
-    and the logits of the positions of their log times between two bounds."""
+    """Fits of Prony modes with a fixed equilibrium modulus. The unknowns u (2 N,) of N modes are the logs of the N
+    strengths, and N logits. A logit gives the position of a log relaxation time between two bounds (0 to 1)."""
 
-    evaluate: Callable[[float, np.ndarray], Solution]
+    evaluate: Callable[[float, np.ndarray], Solution]  # (equilibrium modulus [Pa], starting points u) -> best fit
     ends: tuple[float, float]  # logs of the shortest and the longest relaxation time that is allowed
 
     def unknowns(self, strengths: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -140,9 +139,9 @@ def _with_one_more(
 
 
 def _end(family: _Family, modulus: float, found: Solution, limit: float, step: float, whole: float) -> float:
-    """Return the equilibrium modulus at which the sum of squares reaches its limit, on one side of the minimum. The
-    sign of `step` [Pa], the first step away from the minimum, selects the side. The search also ends at 0 and above 10
-    times `whole` (G0)."""
+    """Return one end of the interval: the equilibrium modulus at which the sum of squares reaches `limit`. The search
+    begins at the minimum (`modulus`). The sign of its first step `step` [Pa] selects the side of the minimum. The
+    search also ends at 0, and above 10 times `whole` (G0)."""
     u, inside, outside = np.asarray(found.u), modulus, None
     while outside is None:
         trial = max(0.0, inside + step)
@@ -177,8 +176,8 @@ def with_interval(
     Args:
         fit: the fit of these tests.
         tests, noises: see `equilibrium_interval`.
-        factor: reported equilibrium modulus divided by the one that fits the data. It differs from 1 for a compressed
-            sample.
+        factor: reported equilibrium modulus, divided by the equilibrium modulus that fits the data. It differs from 1
+            for a compressed sample.
         common: standard error [Pa] of the equilibrium modulus that comes from an error common to all measured values.
     """
     if fit.parameters is not None or not fit.converged:
@@ -204,7 +203,8 @@ def with_interval(
 
 
 def _told_interval(ends: tuple[float, float, float], error: float, found: Interval, whole: float) -> list[str]:
-    """Return a warning if an end of (low, value, high) lies much farther from the value than two standard errors.
+    """Return a warning if an end of the interval lies much farther from the value than two standard errors. `ends`:
+    (low, value, high). For a fluid, a warning is given if `high` is at least `LARGE` times `whole` (G0).
 
     The comparison uses the factor `NORMAL` even for few independent residuals, where Student's t is larger, because
     readers understand the number after ± as a standard error.

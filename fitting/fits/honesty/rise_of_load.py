@@ -20,9 +20,9 @@ SHOWN = 2.0
 
 
 def with_rise_of_load(fit: TimeFit, test: TimeTest, prony: TimeFit) -> TimeFit:
-    """Return the fit. A warning is added if G0 changes by more than `SHOWN` standard errors when steps of the load are
-    assumed instead of linear changes between rows. If `fit` is a fit of Prony modes, the changes of all parameters are
-    then added to its details.
+    """Return the fit. The test is fitted again with steps of the load instead of linear changes between rows. A warning
+    is added if this changes G0 by more than `SHOWN` standard errors. If `fit` is a fit of Prony modes, the changes of
+    all parameters are then added to its details.
 
     Args:
         fit: a fit of any model to this test.
@@ -67,7 +67,7 @@ def with_steps(test: TimeTest) -> TimeTest:
         driven[last + 1 : row] = driven[last]
     time, driven, answer = rows_before_jumps(jumps, 0.0, test.time, driven, test.answer)
     steps = test._replace(time=time, driven=driven, answer=answer, used=np.isin(time, test.time[test.used]))
-    # The load may begin later now. The responses between both starts then belong to rest.
+    # The load may now begin later. Then the values measured between the two beginnings belong to the state at rest.
     return steps._replace(used=steps.used & ((time <= test.begun) | (time > steps.begun)))
 
 

@@ -1,10 +1,10 @@
 """Stress that relaxes before the first measured value of a relaxation or creep test is missing in G0. The missing part
 is estimated from the decrease of the stress at the beginning of the record.
 
-Let r be the decrease of the stress in one half decade, divided by the decrease in the next one. If r < 1 is constant,
-the decreases before the record are r, r^2, … times the decrease in the first half decade of the record. A material with
-a single relaxation time, far longer than the first time of the record, gives r = 0.32, and nothing is missing in G0. If
-the stress is a negative power of time, r >= 1 and G0 has no upper bound.
+Let r be the decrease of the stress in one half decade, divided by the decrease in the next half decade. If r < 1 is
+constant, the decreases before the record are r, r^2, … times the decrease in the first half decade of the record. A
+material with a single relaxation time, far longer than the first time of the record, gives r = 0.32, and nothing is
+missing in G0. If the stress is a negative power of time, r >= 1 and G0 has no upper bound.
 """
 
 import numpy as np

@@ -26,9 +26,9 @@ _stress = jax.jit(homogeneous.nominal_stress)
 
 
 class _Cause(NamedTuple):
-    """Another meaning of the columns of a curve. The driven quantity is the imposed one, for example the stretch. The
-    function `driven` computes the true driven quantity from (driven column, number). The function `column` computes the
-    values in the stress column from (nominal stress, true driven quantity, number).
+    """Another meaning of the columns of a curve. The driven quantity is the quantity that the test imposes,
+    for example the stretch. The function `driven` computes the true driven quantity from (driven column, number). The
+    function `column` computes the values in the stress column from (nominal stress, true driven quantity, number).
 
     `number` is the fitted offset, the same for all curves. The optimiser uses it in dimensionless form: divided by the
     stress scale of the first curve with a structured misfit if the offset is a stress, otherwise by the range of

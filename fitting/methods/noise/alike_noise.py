@@ -150,8 +150,8 @@ def _to_neighbours(distance: np.ndarray) -> float:
 
 
 def _subset(places: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Return the indices of at most `MOST` of the m residuals `own` (m,): half of them near one point, the other half
-    from the whole body."""
+    """Choose at most `MOST` of the residuals with the indices `own` (m,), and return their indices: half of them are
+    near one point, the other half comes from the whole body."""
     if len(own) <= MOST:
         return own
     rng = np.random.default_rng(0)
@@ -169,7 +169,8 @@ def _matern(distance: np.ndarray, order: str, length: float) -> np.ndarray:
 
 
 def _probability_at(data: list, far: list[np.ndarray], order: str, length: float, part: float) -> tuple[float, float]:
-    """Return the logarithm of the restricted likelihood, up to a constant, and the most probable level s."""
+    """Return the logarithm of the restricted likelihood, up to a constant, and the most probable level s. `data`:
+    residuals and their derivatives for each group. `far`: distances between the points of each group."""
     p = data[0][1].shape[1]
     determinant, squares, b, A = 0.0, 0.0, np.zeros(p), np.zeros((p, p))
     for (r, J), distance in zip(data, far, strict=True):

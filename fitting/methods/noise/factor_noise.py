@@ -43,8 +43,8 @@ def factors_of_series(
 
     There are few factors, so their standard deviation is uncertain. If the residuals show factors, their standard
     deviation is enlarged by Student's t with K - 1 degrees of freedom. If noise alone may explain the factors, their
-    standard deviation is not enlarged. If the unknowns can compensate most of the factors, the residuals hardly show
-    them. Then `hidden` and `moves` describe the factors that the residuals do not exclude.
+    standard deviation is not enlarged. If the unknowns can compensate most of the effect of the factors, the residuals
+    hardly show the factors. Then `hidden` and `moves` describe the largest factors that the residuals do not exclude.
 
     Args:
         counts: number of rows of each of the K series.

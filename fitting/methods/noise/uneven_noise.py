@@ -31,8 +31,8 @@ def growing_root(J: np.ndarray, r: np.ndarray, size: np.ndarray, slope: np.ndarr
     """Return the square root (P, n) of the covariance of P parameters for noise proportional to `size` (n,). The result
     is 0 if noise of equal size at all points has a higher restricted likelihood.
 
-    This function is needed because `uneven_root` cannot determine the noise of a point with a leverage near 1, since
-    the fit passes through this point.
+    `uneven_root` cannot determine the noise of a point with a leverage near 1, because the fit passes through this
+    point. So this function is needed.
     """
     (n, p), largest, none = J.shape, np.abs(size).max(initial=0.0), np.zeros((len(slope), len(r)))
     if not (np.all(np.isfinite(J)) and np.all(np.isfinite(r)) and p and n > p + 1 and largest > 0):
@@ -54,8 +54,9 @@ def probability_of_sizes(J: np.ndarray, r: np.ndarray, size: np.ndarray) -> tupl
     return -float(np.sum(np.log(np.diagonal(L)))) - len(L) * np.log(max(level, 1e-300)), level
 
 
-#: If equal noise in two groups of residuals is less probable than _CHANCE, their noise has different size. The test is
-#: made only if the smallest singular value of the scaled Jacobian, divided by the largest one, is at least _CONDITION.
+#: The noise of two groups of residuals counts as different in size if equal noise would give such a difference with a
+#: probability below _CHANCE. The test is made only if the smallest singular value of the scaled Jacobian, divided by
+#: the largest one, is at least _CONDITION.
 _CHANCE, _CONDITION = 1e-3, 1e-8
 
 

@@ -265,11 +265,11 @@ def _of_scales(organ: Organ, found: Found) -> list[str]:
 
 
 def _sign(organ: Organ, found: Found) -> list[str]:
-    """Return a warning if every loss modulus that the data determine is negative. No passive material has a negative
-    loss modulus.
+    """Return a warning if, at some frequency, every loss modulus that the data determine is negative. No passive
+    material has a negative loss modulus.
 
-    If regions are given, only the moduli of the regions are checked, because the loss modulus of an organ of several
-    materials, fitted as one region, may be negative.
+    If regions are given, only the moduli of the regions are checked. The reason: the fitted loss modulus of the whole
+    organ may be negative if the organ consists of several materials.
     """
     wrong, each = [], found.whole if found.parts is None else found.parts
     for f, (hertz, G, error) in enumerate(

@@ -14,8 +14,9 @@ def unwrapped(name: str, phases: np.ndarray) -> tuple[np.ndarray, list[str]]:
     jumps are left, or if phases change so fast from voxel to voxel that jumps cannot be distinguished from waves.
 
     In space, pairs of neighbouring voxels are unwrapped in the order of their reliability (Herraez et al. 2002, Appl.
-    Opt. 41, 7437). After this, a multiple of 2 pi may still be missing in the phase of a whole volume. It is chosen
-    under the assumption that the median phase changes by less than pi from one instant of the period to the next.
+    Opt. 41, 7437). After this, a multiple of 2 pi may still be missing in the phase of a whole volume. This
+    multiple is chosen under the assumption that the median phase changes by less than pi from one instant of the period
+    to the next.
 
     Args:
         name: name of the file, for the messages.

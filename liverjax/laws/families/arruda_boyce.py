@@ -24,7 +24,7 @@ class ArrudaBoyce(Law):
     invariants: ClassVar = ("I1", "J")
 
     def isochoric_energy(self, I1, I2):
-        """Energy: the sum of the series, written as a multiple of (Ibar1 - 3) to avoid cancellation at rest."""
+        """Return the energy: the series, written as a multiple of (Ibar1 - 3) to avoid cancellation at rest."""
         total = 0.0
         for k, c in enumerate(COEFFICIENTS, start=1):
             # (I^k - 3^k) = (I - 3) sum_m I^m 3^(k-1-m), by Horner's rule.
@@ -35,7 +35,7 @@ class ArrudaBoyce(Law):
         return self.mu * (I1 - 3) * total
 
     def isochoric_derivatives(self, I1, I2):
-        """First and second derivative with respect to Ibar1, by Horner's rule."""
+        """Return the first and second derivative with respect to Ibar1, by Horner's rule."""
         t = I1 / self.chain_length
         slope, curvature = 0.0, 0.0
         for k, c in reversed(list(enumerate(COEFFICIENTS, start=1))):
@@ -45,5 +45,5 @@ class ArrudaBoyce(Law):
         return {"I1": self.mu * slope}, {("I1", "I1"): self.mu / self.chain_length * curvature}
 
     def shear_modulus(self):
-        """Shear modulus mu (1 + 3/(5 N) + 99/(175 N^2) + …) [Pa]: twice dW/dIbar1 at rest."""
+        """Return the shear modulus mu (1 + 3/(5 N) + 99/(175 N^2) + …) [Pa]: twice dW/dIbar1 at rest."""
         return 2 * self.isochoric_derivatives(3.0, None)[0]["I1"]

@@ -28,13 +28,13 @@ class Bogen(Law):
         return (self.alpha,)
 
     def stretch_energy(self, X):
-        """Energy mu/alpha X with X = Xi(alpha) - 3."""
+        """Return the energy mu/alpha X with X = Xi(alpha) - 3."""
         return self.mu / self.alpha * X
 
     def stretch_derivatives(self, X):
-        """First derivative mu/alpha. The second derivative is 0."""
+        """Return the first derivative mu/alpha. The second derivative is 0."""
         return (self.mu / self.alpha,), {}
 
     def shear_modulus(self):
-        """Ground-state shear modulus mu alpha / 2 [Pa]."""
+        """Return the ground-state shear modulus mu alpha / 2 [Pa]."""
         return self.mu * self.alpha / 2

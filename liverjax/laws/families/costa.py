@@ -44,11 +44,14 @@ class Costa(Law):
         return sum(terms[:3]) + 2 * sum(terms[3:])
 
     def green_energy(self, E):
-        """Energy, computed with expm1 so that there is no cancellation at rest."""
+        """Return the energy, computed with expm1 so that there is no cancellation at rest."""
         return 0.5 * self.c * jnp.expm1(self._exponent(E))
 
     def green_derivatives(self, E):
-        """Stress S_AB = s b_AB E_AB with s = c exp Q, and moduli: s b_AB (half of it for shears) plus (2/s) S (x) S."""
+        """Return the stress S_AB = s b_AB E_AB with s = c exp Q, and the moduli.
+
+        The moduli are s b_AB (for shears s b_AB/2), plus (2/s) S (x) S.
+        """
         s = self.c * jnp.exp(self._exponent(E))
         b = self._weights()
         S = symmetric(tuple(s * w * E[i][j] for w, (i, j) in zip(b, SIX, strict=True)))
@@ -56,12 +59,12 @@ class Costa(Law):
         return S, GreenModuli(normal, tuple(0.5 * s * w for w in b[3:]), 2 / s)
 
     def shear_modulus(self):
-        """Voigt mean of the shear modulus, c (b_ff + b_ss + b_nn)/15 + c (b_fs + b_fn + b_sn)/10 [Pa]."""
+        """Return the Voigt mean of the shear modulus, c (b_ff + b_ss + b_nn)/15 + c (b_fs + b_fn + b_sn)/10 [Pa]."""
         b = self._weights()
         return self.c * (sum(b[:3]) / 15 + sum(b[3:]) / 10)
 
     def bulk_modulus(self):
-        """Voigt mean of the bulk modulus, bulk + c (b_ff + b_ss + b_nn)/9 [Pa]."""
+        """Return the Voigt mean of the bulk modulus, bulk + c (b_ff + b_ss + b_nn)/9 [Pa]."""
         return (0.0 if self.bulk is None else self.bulk) + self.c * sum(self._weights()[:3]) / 9
 
     def check_directions(self):

@@ -31,14 +31,14 @@ class Exponential(Law):
         return (self.alpha,)
 
     def stretch_energy(self, X):
-        """Energy, computed with expm1 so that there is no cancellation at rest. X = Xi(alpha) - 3."""
+        """Return the energy, computed with expm1 so that there is no cancellation at rest. X = Xi(alpha) - 3."""
         return self.c1 * jnp.expm1(self.c2 * X)
 
     def stretch_derivatives(self, X):
-        """First and second derivative with respect to X: c1 c2 e and c1 c2^2 e, with e = exp(c2 X)."""
+        """Return the first and second derivative with respect to X: c1 c2 e and c1 c2^2 e, with e = exp(c2 X)."""
         slope = self.c1 * self.c2 * jnp.exp(self.c2 * X)
         return (slope,), {(0, 0): self.c2 * slope}
 
     def shear_modulus(self):
-        """Ground-state shear modulus c1 c2 alpha^2 / 2 [Pa]."""
+        """Return the ground-state shear modulus c1 c2 alpha^2 / 2 [Pa]."""
         return self.c1 * self.c2 * self.alpha**2 / 2

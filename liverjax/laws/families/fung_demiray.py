@@ -22,14 +22,14 @@ class FungDemiray(Law):
     invariants: ClassVar = ("I1", "J")
 
     def isochoric_energy(self, I1, I2):
-        """Energy, computed with expm1 so that there is no cancellation at rest."""
+        """Return the energy, computed with expm1 so that there is no cancellation at rest."""
         return 0.5 * self.c1 / self.c2 * jnp.expm1(self.c2 * (I1 - 3))
 
     def isochoric_derivatives(self, I1, I2):
-        """First and second derivative with respect to Ibar1: (c1/2) e and (c1 c2/2) e, e = exp(c2 (Ibar1 - 3))."""
+        """Return dW/dIbar1 = (c1/2) e and d2W/dIbar1^2 = (c1 c2/2) e, with e = exp(c2 (Ibar1 - 3))."""
         slope = 0.5 * self.c1 * jnp.exp(self.c2 * (I1 - 3))
         return {"I1": slope}, {("I1", "I1"): self.c2 * slope}
 
     def shear_modulus(self):
-        """Ground-state shear modulus c1 [Pa]."""
+        """Return the ground-state shear modulus c1 [Pa]."""
         return self.c1

@@ -28,7 +28,7 @@ class Logarithmic(Law):
         return (self.alpha,)
 
     def stretch_energy(self, X):
-        """Energy, computed with log1p so that there is no cancellation at rest. X = Xi(alpha) - 3."""
+        """Return the energy, computed with log1p so that there is no cancellation at rest. X = Xi(alpha) - 3."""
         return -self.c1 * jnp.log1p(-self._filled(X))
 
     def _filled(self, X):
@@ -36,10 +36,10 @@ class Logarithmic(Law):
         return jnp.where(self.c2 * X < 1, self.c2 * X, jnp.nan)
 
     def stretch_derivatives(self, X):
-        """First and second derivative with respect to X: c1 c2/(1 - c2 X) and c1 c2^2/(1 - c2 X)^2."""
+        """Return the first and second derivative with respect to X: c1 c2/(1 - c2 X) and c1 c2^2/(1 - c2 X)^2."""
         pole = self.c2 / (1 - self._filled(X))
         return (self.c1 * pole,), {(0, 0): self.c1 * pole * pole}
 
     def shear_modulus(self):
-        """Ground-state shear modulus c1 c2 alpha^2 / 2 [Pa]."""
+        """Return the ground-state shear modulus c1 c2 alpha^2 / 2 [Pa]."""
         return self.c1 * self.c2 * self.alpha**2 / 2

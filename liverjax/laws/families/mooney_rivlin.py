@@ -48,12 +48,12 @@ class MooneyRivlin(Law):
         return [(getattr(self, name), i, j) for name, (i, j) in _POWERS.items() if getattr(self, name) is not None]
 
     def isochoric_energy(self, I1, I2):
-        """Energy: a polynomial in Ibar1 - 3 and Ibar2 - 3."""
+        """Return the energy: a polynomial in Ibar1 - 3 and Ibar2 - 3."""
         a, b = I1 - 3, I2 - 3
         return sum(c * _monomial(1.0, (a, i), (b, j)) for c, i, j in self.terms())
 
     def isochoric_derivatives(self, I1, I2):
-        """First and second derivatives of the polynomial. They do not contain terms that are always 0."""
+        """Return the first and second derivatives of the polynomial, without those that are always 0."""
         a, b = I1 - 3, I2 - 3
         first, second = {}, {}
         for c, i, j in self.terms():
@@ -70,5 +70,5 @@ class MooneyRivlin(Law):
         return first, second
 
     def shear_modulus(self):
-        """Ground-state shear modulus 2 (c10 + c01) [Pa]."""
+        """Return the ground-state shear modulus 2 (c10 + c01) [Pa]."""
         return 2 * (self.c10 + self.c01)

@@ -21,15 +21,15 @@ class NeoHookean(Law):
     invariants: ClassVar = ("I1", "J")
 
     def isochoric_energy(self, I1, I2):
-        """Energy mu/2 (Ibar1 - 3)."""
+        """Return the energy mu/2 (Ibar1 - 3)."""
         return 0.5 * self.mu * (I1 - 3)
 
     def isochoric_derivatives(self, I1, I2):
-        """First derivative mu/2. The second derivative is 0."""
+        """Return the first derivative mu/2. The second derivative is 0."""
         return {"I1": 0.5 * self.mu}, {}
 
     def shear_modulus(self):
-        """Ground-state shear modulus mu [Pa]."""
+        """Return the ground-state shear modulus mu [Pa]."""
         return self.mu
 
 
@@ -45,12 +45,12 @@ class NeoHookeanCompressible(Law):
     invariants: ClassVar = ("I1", "J")
 
     def strain_energy(self, I):
-        """Complete strain energy density [Pa]."""
+        """Return the complete strain energy density [Pa]."""
         ln = jnp.log(I.J)
         return 0.5 * self.mu * (I.I1 - 3) - self.mu * ln + 0.5 * self.lame_lambda * ln**2
 
     def energy_derivatives(self, I):
-        """Derivatives W_1 = mu/2, W_J = (lambda ln J - mu)/J and W_JJ = (lambda (1 - ln J) + mu)/J^2."""
+        """Return the derivatives W_1 = mu/2, W_J = (lambda ln J - mu)/J and W_JJ = (lambda (1 - ln J) + mu)/J^2."""
         ln = jnp.log(I.J)
         inverse_J = 1 / I.J
         slope = (self.lame_lambda * ln - self.mu) * inverse_J
@@ -58,9 +58,9 @@ class NeoHookeanCompressible(Law):
         return {"I1": 0.5 * self.mu, "J": slope}, {("J", "J"): curvature}
 
     def shear_modulus(self):
-        """Ground-state shear modulus mu [Pa]."""
+        """Return the ground-state shear modulus mu [Pa]."""
         return self.mu
 
     def bulk_modulus(self):
-        """Ground-state bulk modulus lambda + 2/3 mu [Pa]."""
+        """Return the ground-state bulk modulus lambda + 2/3 mu [Pa]."""
         return self.lame_lambda + 2 / 3 * self.mu

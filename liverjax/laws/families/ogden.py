@@ -33,15 +33,15 @@ class Ogden(Law):
         return tuple(self.alpha)
 
     def stretch_energy(self, *X):
-        """Energy: the sum of mu_k/alpha_k X_k."""
+        """Return the energy: the sum of mu_k/alpha_k X_k."""
         return sum(m / a * x for m, a, x in zip(self.mu, self.alpha, X, strict=True))
 
     def stretch_derivatives(self, *X):
-        """First derivatives mu_k/alpha_k. All second derivatives are zero."""
+        """Return the first derivatives mu_k/alpha_k. All second derivatives are zero."""
         return tuple(m / a for m, a in zip(self.mu, self.alpha, strict=True)), {}
 
     def shear_modulus(self):
-        """Ground-state shear modulus: sum of mu_k alpha_k / 2 [Pa]."""
+        """Return the ground-state shear modulus: sum of mu_k alpha_k / 2 [Pa]."""
         return sum(m * a for m, a in zip(self.mu, self.alpha, strict=True)) / 2
 
     def check(self):

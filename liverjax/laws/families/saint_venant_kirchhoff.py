@@ -19,19 +19,19 @@ class SaintVenantKirchhoff(Law):
     invariants: ClassVar = ("I1", "I2")
 
     def strain_energy(self, I):
-        """Complete energy as a function of I1 - 3 and I2 - 3, so that there is no cancellation at rest."""
+        """Return the complete energy as a function of I1 - 3 and I2 - 3, so that there is no cancellation at rest."""
         a, b = I.I1 - 3, I.I2 - 3
         return self.lame_lambda / 8 * a * a + self.mu / 4 * (a * a + 4 * a - 2 * b)
 
     def energy_derivatives(self, I):
-        """Derivatives W_1 = lambda/4 (I1 - 3) + mu/2 (I1 - 1), W_2 = -mu/2 and W_11 = lambda/4 + mu/2."""
+        """Return the derivatives W_1 = lambda/4 (I1 - 3) + mu/2 (I1 - 1), W_2 = -mu/2 and W_11 = lambda/4 + mu/2."""
         first = {"I1": 0.25 * self.lame_lambda * (I.I1 - 3) + 0.5 * self.mu * (I.I1 - 1), "I2": -0.5 * self.mu}
         return first, {("I1", "I1"): 0.25 * self.lame_lambda + 0.5 * self.mu}
 
     def shear_modulus(self):
-        """Ground-state shear modulus mu [Pa]."""
+        """Return the ground-state shear modulus mu [Pa]."""
         return self.mu
 
     def bulk_modulus(self):
-        """Ground-state bulk modulus lambda + 2/3 mu [Pa]."""
+        """Return the ground-state bulk modulus lambda + 2/3 mu [Pa]."""
         return self.lame_lambda + 2 / 3 * self.mu

@@ -26,22 +26,22 @@ class StableNeoHookean(Law):
         return 4 / 3 * self.mu, self.lame_lambda + 5 / 6 * self.mu
 
     def strain_energy(self, I):
-        """Complete energy, computed with l/2 [(J - a)^2 - (1 - a)^2] = l/2 (J - 1)^2 - 3 m/4 (J - 1)."""
+        """Return the complete energy, computed with l/2 [(J - a)^2 - (1 - a)^2] = l/2 (J - 1)^2 - 3 m/4 (J - 1)."""
         m, l = self._constants()
         shift = I.J - 1
         return 0.5 * m * (I.I1 - 3 - jnp.log(I.I1 + 1) + math.log(4)) + shift * (0.5 * l * shift - 0.75 * m)
 
     def energy_derivatives(self, I):
-        """Derivatives W_1 = m/2 I1/(I1 + 1), W_J = l (J - 1) - 3 m/4, W_11 = m/2/(I1 + 1)^2 and W_JJ = l."""
+        """Return the derivatives W_1 = m/2 I1/(I1 + 1), W_J = l (J - 1) - 3 m/4, W_11 = m/2/(I1 + 1)^2 and W_JJ = l."""
         m, l = self._constants()
         inverse = 1 / (I.I1 + 1)
         first = {"I1": 0.5 * m * I.I1 * inverse, "J": l * (I.J - 1) - 0.75 * m}
         return first, {("I1", "I1"): 0.5 * m * inverse * inverse, ("J", "J"): l}
 
     def shear_modulus(self):
-        """Ground-state shear modulus mu [Pa]."""
+        """Return the ground-state shear modulus mu [Pa]."""
         return self.mu
 
     def bulk_modulus(self):
-        """Ground-state bulk modulus lambda + 2/3 mu [Pa]."""
+        """Return the ground-state bulk modulus lambda + 2/3 mu [Pa]."""
         return self.lame_lambda + 2 / 3 * self.mu

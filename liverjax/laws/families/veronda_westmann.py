@@ -22,15 +22,15 @@ class VerondaWestmann(Law):
     invariants: ClassVar = ("I1", "I2", "J")
 
     def isochoric_energy(self, I1, I2):
-        """Energy, computed with expm1 so that there is no cancellation at rest."""
+        """Return the energy, computed with expm1 so that there is no cancellation at rest."""
         return self.c1 * jnp.expm1(self.c2 * (I1 - 3)) - 0.5 * self.c1 * self.c2 * (I2 - 3)
 
     def isochoric_derivatives(self, I1, I2):
-        """Derivatives W_1 = c1 c2 e, W_2 = -c1 c2/2 and W_11 = c1 c2^2 e, with e = exp(c2 (Ibar1 - 3))."""
+        """Return the derivatives W_1 = c1 c2 e, W_2 = -c1 c2/2 and W_11 = c1 c2^2 e, with e = exp(c2 (Ibar1 - 3))."""
         product = self.c1 * self.c2
         slope = product * jnp.exp(self.c2 * (I1 - 3))
         return {"I1": slope, "I2": -0.5 * product}, {("I1", "I1"): self.c2 * slope}
 
     def shear_modulus(self):
-        """Ground-state shear modulus c1 c2 [Pa]."""
+        """Return the ground-state shear modulus c1 c2 [Pa]."""
         return self.c1 * self.c2

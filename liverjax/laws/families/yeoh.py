@@ -21,15 +21,15 @@ class Yeoh(Law):
     invariants: ClassVar = ("I1", "J")
 
     def isochoric_energy(self, I1, I2):
-        """Energy: a cubic polynomial in Ibar1 - 3, by Horner's rule."""
+        """Return the energy: a cubic polynomial in Ibar1 - 3, by Horner's rule."""
         a = I1 - 3
         return a * (self.c1 + a * (self.c2 + a * self.c3))
 
     def isochoric_derivatives(self, I1, I2):
-        """First and second derivative: c1 + 2 c2 a + 3 c3 a^2 and 2 c2 + 6 c3 a, with a = Ibar1 - 3."""
+        """Return the first and second derivative: c1 + 2 c2 a + 3 c3 a^2 and 2 c2 + 6 c3 a, with a = Ibar1 - 3."""
         a = I1 - 3
         return {"I1": self.c1 + a * (2 * self.c2 + 3 * self.c3 * a)}, {("I1", "I1"): 2 * self.c2 + 6 * self.c3 * a}
 
     def shear_modulus(self):
-        """Ground-state shear modulus 2 c1 [Pa]."""
+        """Return the ground-state shear modulus 2 c1 [Pa]."""
         return 2 * self.c1

@@ -51,8 +51,8 @@ class _Block(NamedTuple):
 def read_abaqus(path: Path) -> "meshio.Mesh":
     """Read an Abaqus input file with one part. The mesh and its sets have the form in which `meshio.read` returns them.
 
-    A set of the part has the name PART.SET if the assembly has a set with the same name. Nodes of the assembly are
-    reference points, which are ignored.
+    If the part and the assembly both have a set named SET, the set of the part gets the name PART.SET. Nodes of the
+    assembly are reference points, which are ignored.
 
     Raises:
         InputError: the file cannot be read, has several parts, or creates nodes or elements by keywords such as *NGEN.
@@ -151,7 +151,7 @@ def _of_one_part(cards: list[_Card]) -> list[_Card]:
         inside.append(depth > 0)
         depth += card.keyword in ("PART", "INSTANCE")
     marked = [card._replace(inside=own) for card, own in zip(cards, inside, strict=True)]
-    # Cards outside the part keep their sets of nodes or elements, as empty sets.
+    # NODE and ELEMENT cards outside the part lose their data lines. Their sets still exist, but are empty.
     kept = [card for card in marked if card.inside or card.keyword not in ("NODE", "ELEMENT")]
     return kept + [
         card._replace(lines=[]) for card in marked if not card.inside and card.keyword in ("NODE", "ELEMENT")
@@ -225,7 +225,7 @@ def _sets(
     """
     making = {"NSET": "NODE", "ELSET": "ELEMENT"}[key]
     names: dict[str, str] = {}  # names in small letters -> names as the file first writes them
-    found: dict[tuple[bool, str], list[int]] = {}  # (whether the set is of the part, name) -> its cards
+    found: dict[tuple[bool, str], list[int]] = {}  # (whether the set belongs to the part, name) -> its cards
     for k, card in enumerate(cards):
         if key in card.parameters and card.keyword in (key, making):
             name = card.parameters[key].lower()
@@ -256,8 +256,8 @@ def _sets(
 def _surfaces(
     cards: list[_Card], element_sets: dict[str, set[int]], blocks: dict[int, _Block]
 ) -> dict[str, np.ndarray]:
-    """Return {name of a ``*SURFACE`` card: corners (m, 3) of its triangles}. A data line is an element or a set of
-    elements, with one of `_FACES`. Other surfaces (of nodes, of shells, analytical ones) are ignored."""
+    """Return {name of a ``*SURFACE`` card: corners (m, 3) of its triangles}. A data line contains an element, or a set
+    of elements, and one of `_FACES`. Other surfaces (of nodes or shells, or analytical surfaces) are ignored."""
     tetrahedra = [block for block in blocks.values() if block.kind in ("tetra", "tetra10")]
     corners = {k: own[:4] for block in tetrahedra for k, own in zip(block.labels, block.nodes, strict=True)}
     sets = {key: own for name, own in element_sets.items() for key in (name.lower(), name.rpartition(".")[2].lower())}
@@ -276,11 +276,11 @@ def _surfaces(
 
 
 def _listed(card: _Card, of_elements: dict[str, set[int]]) -> tuple[set[int], list[str]]:
-    """Return the numbers and the names of other sets (in small letters) in a card of a set."""
+    """Return the numbers, and the names of other sets (in small letters), that a card of a set contains."""
     if card.keyword == "NSET" and "ELSET" in card.parameters:
         return of_elements.get(card.parameters["ELSET"].lower(), set()), []
     numbers, others = set(), []
-    # In the assembly, numbers without the name of an instance are those of reference points.
+    # In the assembly, numbers without the name of an instance belong to reference points.
     of_part = card.inside or "INSTANCE" in card.parameters
     for line in card.lines:
         cells = [cell for cell in line if cell]
@@ -306,8 +306,7 @@ def _nodes_of(element_sets: dict[str, set[int]], blocks: dict[int, _Block], labe
 
 
 def _range_of(card: _Card, cells: list[str]) -> set[int]:
-    """Return all numbers of the range that a data line describes by its first number, last number and step (default
-    1)."""
+    """Return all numbers of a range. The data line contains the first number, the last number and the step (or 1)."""
     if not 2 <= len(cells) <= 3 or not all(cell.isdigit() for cell in cells) or cells[2:] == ["0"]:
         raise _Wrong(f"*{card.keyword}, GENERATE has the line {','.join(cells)}; give first, last, step")
     first, last, step = (int(cell) for cell in (*cells, "1")[:3])
@@ -315,5 +314,5 @@ def _range_of(card: _Card, cells: list[str]) -> set[int]:
 
 
 def _indices_of(labels: list[int], members: set[int]) -> np.ndarray:
-    """Return the indices of the members among the labels. Numbers that are no label are ignored."""
+    """Return the indices of the labels that are members. Members that are not labels are ignored."""
     return np.array([k for k, label in enumerate(labels) if label in members], int)

@@ -43,7 +43,7 @@ class Elements(NodalForce):
         return None
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Nodal forces (V, 3) [N]: the gradient of the energy with respect to the positions x (V, 3)."""
+        """Return the nodal forces (V, 3) [N]: the gradient of the energy with respect to the positions x (V, 3)."""
         p, nodes = self.tangents(mesh), self.nodes(mesh)
         f = self._vectors(p, x[nodes])
         T = _tension(jax.grad(lambda C: jnp.sum(self.energies(mesh, C)))(_metric(f)))
@@ -52,12 +52,12 @@ class Elements(NodalForce):
         return jnp.zeros_like(x).at[nodes].add(own)
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
-        """Energy [J] of all elements."""
+        """Return the energy [J] of all elements."""
         f = self._vectors(self.tangents(mesh), x[self.nodes(mesh)])
         return jnp.sum(self.energies(mesh, _metric(f)))
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """Stiffness of the elements: second derivatives of the energy with respect to the positions x (V, 3)."""
+        """Return the stiffness: second derivatives of the energy with respect to the positions x (V, 3)."""
         p, nodes = self.tangents(mesh), self.nodes(mesh)
         f = self._vectors(p, x[nodes])
         C = _metric(f)

@@ -110,7 +110,7 @@ class Ligament(Physics):
         return Fibres(at=self.nodes, weights=self.weights, to=self.to, rest=rest, spring=self.stiffness / len(rest))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Return nodes (n,) and directions (n, 3) of the fibres to a point outside that are taut when a run begins."""
+        """Return nodes (n,) and directions (n, 3) of the fibres to a point outside, if taut when a run begins."""
         if self.to is None:
             return np.zeros(0, int), np.zeros((0, 3))
         lengths, rest = map(np.asarray, _lengths_and_rest(self, mesh))

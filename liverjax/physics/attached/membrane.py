@@ -1,4 +1,4 @@
-"""A membrane on a part of the surface, for example the capsule. A membrane follows the surface without bending
+"""A membrane on a part of the surface, for example the capsule. It moves with the surface and has no bending
 stiffness.
 
 The law of the membrane acts in its plane. The stress through the thickness is 0 (plane stress). If the law has an
@@ -112,9 +112,9 @@ class Stretched(Elements):
         return (0.5 * self.thickness * r11 * r22)[None] * jnp.asarray(weights, W.dtype)[:, None] * W
 
     def _edges(self, mesh: TetMesh) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return the entries r11, r12 and r22, each (m,) [m], of a Cholesky factor for each of the m triangles.
+        """Return the entries r11, r12 and r22, each (m,) [m], of a 2 x 2 Cholesky factor for each of the m triangles.
 
-        It is the Cholesky factor of the 2 x 2 matrix of scalar products of two edges in the reference shape.
+        The factorised matrix contains the scalar products of two edges of the triangle in the reference shape.
         """
         corners = jnp.moveaxis(mesh.points[self.triangles[:, :3]], 0, -1)
         first, second = corners[1] - corners[0], corners[2] - corners[0]

@@ -51,9 +51,9 @@ class RoughObstacle(Obstacle):
         return replace(plain, friction=table["friction"])
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nodes of triangles that touch the obstacle at the beginning, constrained in all directions.
+        """Return the nodes of triangles that touch the obstacle at the beginning, and their constrained directions.
 
-        If the friction coefficient is 0, the nodes are constrained only along the normal.
+        These are all three directions. If the friction coefficient is 0, only the normal is constrained.
         """
         nodes, normals = super().holds(mesh)
         if not np.all(np.asarray(self.friction) > 0):

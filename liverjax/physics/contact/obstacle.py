@@ -228,7 +228,7 @@ class Touching(NodalForce):
         return contact_force(self.obstacle, mesh, x, moved)
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
-        """Energy [J] of the contact: half of stiffness times depth squared."""
+        """Return the energy [J] of the contact: half of stiffness times depth squared."""
         depth = jnp.minimum(_distances(self.obstacle, mesh, x, self.now(1.0)).value, 0.0)
         return 0.5 * jnp.sum(weighted_stiffness(self.obstacle, mesh) * depth**2)
 
@@ -276,7 +276,7 @@ def depths(d: Distance, near: jax.Array) -> jax.Array:
     """Return the signed distances (Q, m) [m] of points inside the obstacle (negative), and 0 for other points.
 
     Points nearer than `near` (m,) [m] count as pressed, so they have a stiffness. `jnp.minimum(d.value, 0)` is not
-    used, because JAX gives it only half of the derivative at a point that just touches.
+    used, because its derivative in JAX is only half of the correct value at a point that just touches.
     """
     pressed = d.value - jax.lax.stop_gradient(jnp.maximum(d.value, 0.0))
     return jnp.where(d.value <= near[None], pressed, 0.0)
@@ -408,9 +408,9 @@ def _radius_and_width(obstacle: Obstacle, mesh: TetMesh) -> tuple[float, float]:
 
 
 def touches_without_pressure(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) -> bool:
-    """Return whether the surface touches the obstacle at its initial position without pressure.
+    """Return whether the surface touches the obstacle without pressure.
 
-    x (V, 3) are the positions of the body.
+    The obstacle is at its initial position, and x (V, 3) are the positions of the body.
     """
     d = _distances(obstacle, mesh, x, obstacle.displacement(0, 1, 0.0))
     nothing = d.value >= -_TOUCHING * jnp.sqrt(_triangle_areas(obstacle, mesh))[None]

@@ -10,7 +10,7 @@ import numpy as np
 from liverjax.mesh.locate import around_a_point, around_a_point_in_plane, straight_corners
 from liverjax.mesh.tetrahedra import TetMesh
 
-#: Maximum number of positions that are checked along the path of a step.
+#: Maximum number of positions that are checked along the path of the obstacle in a step.
 _MOST = 256
 
 
@@ -65,8 +65,8 @@ def passed_in_step(
     """Return how an obstacle entered or passed the body in a step: "has its centre in", "went through", or "".
 
     The obstacle went through if a position on its path is inside the body both at the beginning and at the end of the
-    step. An obstacle that only leaves or pushes the body has no such position: the body recovers behind the first, and
-    moves away in front of the second.
+    step. If the obstacle only leaves the body, the body fills the space behind it: positions there are inside only at
+    the end. If it pushes the body, the body moves away in front of it: positions there are inside only before the step.
 
     Args:
         positions: nodal positions (2, V, 3) [m] at the beginning and at the end of the step.

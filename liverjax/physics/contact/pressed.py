@@ -136,7 +136,7 @@ class PressedObstacle(Obstacle):
     def freeze(self, memory: Any, step: Step) -> "Pressing":
         """Return the force term of a step.
 
-        It stores the magnitudes of the force at both ends of the step, and the displacement of the obstacle at its
+        It stores the magnitudes of the force at both ends of the step, and the displacement of the obstacle at the
         beginning.
         """
         dt, dtype = 0.0 if step.dt is None else step.dt, step.x.dtype
@@ -187,7 +187,7 @@ class Pressing(Touching):
         return self.travel(self.points(x), s) * self.direction
 
     def travel(self, at: jax.Array, s: Number) -> jax.Array:
-        """Return the displacement () [m] along the force at which contact and force balance; NaN if none is found."""
+        """Return the displacement () [m] along the force at which the contact balances it; NaN if none is found."""
         load = self.load[0] + s * (self.load[1] - self.load[0])
         found = self._found(*jax.lax.stop_gradient((at, load)))
         # Newton steps that begin at the solution do not change its value, but they give its derivatives: one step gives
@@ -214,7 +214,7 @@ class Pressing(Touching):
         """Find the displacement () [m] of the obstacle by Newton's method; NaN if none is found.
 
         The contact force grows with the displacement. A step of Newton's method is at most twice the maximum depth, or
-        twice the lower bound `least` of this depth if that is larger.
+        twice the lower bound `least` of this depth if this bound is larger.
         """
         own = jax.lax.stop_gradient(self)
         first = own._resistance(at, own.before)[0]

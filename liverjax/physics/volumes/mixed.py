@@ -5,12 +5,12 @@ With pressures p the energy per volume is
 
     W_isochoric + gamma g^2 / 2 + p g - p^2 / (2 (K - gamma)),
 
-with p linear in every element and continuous. For the p at which this energy is stationary, the energy is U with g
-averaged by the shape functions of p. So volume changes are limited only on average, not at every point. The part gamma
-of the bulk modulus stays in the terms of the displacements, so that their matrix is positive definite. gamma is min(mu,
-K/2) with the shear modulus mu, and a quarter of this in linear elements. The finer the mesh, the less the solution
-depends on gamma. Pressures and positions are unknowns of the same system. If the pressures were eliminated, Newton's
-method would not converge for large K.
+with p linear in every element and continuous. At the p for which this energy is stationary, it consists of gamma g^2/2
+and (K - gamma) g^2/2, with g in the second term averaged by the shape functions of p. So a large K limits volume
+changes only on average, not at every point. The part gamma of the bulk modulus stays in the terms of the displacements,
+so that their matrix is positive definite. gamma is min(mu, K/2) with the shear modulus mu, and a quarter of this in
+linear elements. The finer the mesh, the less the solution depends on gamma. Pressures and positions are unknowns of the
+same system. If the pressures were eliminated, Newton's method would not converge for large K.
 
 In linear elements, the positions do not determine all pressures: some pressures that alternate from node to node cause
 no force. For large K these pressures would grow without bound. So linear elements have a stabilisation term, - (p -
@@ -174,7 +174,8 @@ class Mixed(VolumeStress):
     def balance(self, mesh: TetMesh, pressure: jax.Array, J: jax.Array) -> jax.Array:
         """Return the residual (V,) [m^3] of the pressure equation, which is 0 at a solution.
 
-        It contains the integrals of the shape functions of p times g - p/(K - gamma).
+        It contains the integrals of the shape functions of p times g - p/(K - gamma). In linear elements, the
+        stabilisation term is subtracted.
         """
         return integrals(mesh, strain(self.kind, J)) - self.compliance(mesh, pressure)
 

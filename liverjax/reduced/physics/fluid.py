@@ -82,7 +82,7 @@ def reduced_sponge(model: ReducedModel, scene: Scene) -> ReducedSponge:
 
 
 def porosity_at_points(model: ReducedModel, scene: Scene) -> Porosity:
-    """Return the porosity with one value of each parameter for each of the S points (S,), not for each element."""
+    """Return the porosity. Parameters with one value per element get one value for each of the S points (S,)."""
     assert scene.porosity is not None
     own = porosity_of_elements(scene.porosity, scene.region, scene.mesh)
     elements = model.points % scene.mesh.number_of_elements
@@ -116,7 +116,7 @@ def flowing(model: ReducedModel, sponge: ReducedSponge, memory: ReducedFluid, dt
 
 
 def storage_and_flow(model: ReducedModel, porosity: Porosity, F: jax.Array, dt: Number) -> tuple[jax.Array, jax.Array]:
-    """Return vectors (m, 4, S) and (m, 3, S) [m^1.5/Pa^0.5] for m pressure modes and S points. Their scalar products
+    """Return vectors (m, 4, S) and (m, 3, S) [Pa^-0.5] for m pressure modes and S points. Their scalar products
     are the matrices S and dt D (module docstring), for a step that begins with the deformation gradients F (9, S)."""
     modes, w = model.pressures, model.weights
     assert modes is not None
@@ -130,7 +130,7 @@ def storage_and_flow(model: ReducedModel, porosity: Porosity, F: jax.Array, dt: 
 
 
 def _stored_at_vertices(model: ReducedModel, sponge: ReducedSponge, J: jax.Array) -> jax.Array:
-    """Return the storage matrix (m, m) [m^3/Pa] of m pressure modes as a sum over vertices. `J` (S,): volume ratios at
+    """Return the storage matrix (m, m) [1/Pa] of m pressure modes as a sum over vertices. `J` (S,): volume ratios at
     the S points."""
     modes, lumped = model.pressures, sponge.lumped
     assert modes is not None and lumped is not None
@@ -156,8 +156,8 @@ def pressure_coordinates(own: Flowing, J: jax.Array) -> jax.Array:
 def volume_stress(model: ReducedModel, porosity: Porosity, p: jax.Array, F: jax.Array) -> jax.Array:
     """Return the volumetric part (sigma_Heq(J) - P) cof F (9, S) [Pa] of the first Piola-Kirchhoff stress at S points.
 
-    sigma_Heq is the volumetric stress of the drained body. `p` (m,) [Pa]: coordinates of the pressure P in m modes; `F`
-    (9, S): deformation gradients.
+    sigma_Heq is the volumetric stress of the drained body. `p` (m,) [Pa m^1.5]: coordinates of the pressure P in m
+    modes; `F` (9, S): deformation gradients.
     """
     matrix = as_matrix(F)
     stress = _scalars(model, porosity, p, matrix).first["J"]
@@ -183,7 +183,7 @@ def volume_blocks(model: ReducedModel, own: Flowing, F: Matrix, pairs: tuple[tup
 
 
 def stiffness_of_pressures(model: ReducedModel, own: Flowing, F: Matrix) -> jax.Array:
-    """Return the stiffness (n, n) [N/m] due to the change of the pressures with the n reduced coordinates of the
+    """Return the stiffness (n, n) [N m^-4] due to the change of the pressures with the n reduced coordinates of the
     motion."""
     n = model.number_of_modes
     if own.porosity.scheme == "lagged":
@@ -194,6 +194,6 @@ def stiffness_of_pressures(model: ReducedModel, own: Flowing, F: Matrix) -> jax.
 
 
 def advanced_fluid(own: Flowing, F: jax.Array) -> ReducedFluid:
-    """Return the state of the fluid at the end of a step. `F` (9, S): deformation gradients at the S points then."""
+    """Return the state of the fluid at the end of a step. `F` (9, S): deformation gradients at this time."""
     lagged = own.porosity.scheme == "lagged"
     return ReducedFluid(pressure_coordinates(own, determinant(as_matrix(F))), F, own.J if lagged else None)

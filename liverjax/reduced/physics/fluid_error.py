@@ -62,7 +62,7 @@ def linear_fluid(scene: Scene, free: np.ndarray) -> LinearFluid:
 
     shape = mesh.weights.shape
     J = scipy.sparse.hstack([slopes[i] for i in range(3)]).tocsc()
-    # Reorder the columns: from all x, then all y, then all z, to the column 3 * node + component.
+    # So far, the columns are all x, then all y, then all z. Now component c of node k gets the column 3 k + c.
     J = J[:, np.arange(3 * mesh.number_of_nodes).reshape(3, -1).T.ravel()][:, free]
     unknown = np.flatnonzero(np.asarray(unknown_pressures(porosity, mesh, mesh.points.dtype)))
     values, vertex_slopes = values[:, unknown], [g[:, unknown] for g in vertex_slopes]

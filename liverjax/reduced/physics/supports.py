@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def refuse_other_physics(scene: Scene) -> None:
-    """Raise InputError if `scene.physics` contains objects other than the supports of the module docstring.
+    """Raise InputError if `scene.physics` contains objects other than the supports that the module docstring names.
 
     Raises:
         InputError: the scene has membranes, ligaments, vessels, obstacles, springs with a history, or sliding nodes in
@@ -74,7 +74,7 @@ def forces_of_springs(scene: Scene, u: jax.Array) -> jax.Array:
 
 
 def reduced_springs(modes: jax.Array, scene: Scene) -> jax.Array | None:
-    """Return the reduced stiffness (n, n) [N/m] of all springs for n modes (n, V, 3).
+    """Return the reduced stiffness (n, n) [N m^-4] of all springs for n modes (n, V, 3).
 
     Return None if the scene has no springs.
     """

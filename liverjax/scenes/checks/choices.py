@@ -68,7 +68,7 @@ def check_choices(scene: Scene) -> None:
 
 
 def _refuse_what_moves_in_time(scene: Scene) -> None:
-    """Raise InputError if, for harmonic motion, an entry of the scene has a history or an obstacle moves."""
+    """Raise InputError if an entry of a scene with harmonic motion has a history, or if an obstacle moves."""
     for name in histories(scene):
         raise InputError(f"{name}.history cannot be used with kind = 'harmonic': give only the amplitudes")
     for name, part in named_physics(scene):

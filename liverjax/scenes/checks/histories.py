@@ -1,4 +1,4 @@
-"""Warn about histories of loads and motions that a run does not follow: peaks between two steps, or late beginnings."""
+"""Find histories of loads and motions that a run does not follow: they have peaks between two steps, or begin late."""
 
 import numpy as np
 
@@ -9,8 +9,8 @@ MISSED = 0.05
 
 
 def cautions_of_histories(scene: Scene, ends: np.ndarray) -> list[str]:
-    """Warn about each history that begins after the run. Also warn about each history that changes within a step, since
-    the run uses only its values at the ends of steps.
+    """Return a warning for each history that begins after the end of the run, and for each history that is not linear
+    within the steps. The run uses only the values of a history at the ends of steps.
 
     Args:
         scene: `Scene` with known numbers (not inside jit, grad or vmap).

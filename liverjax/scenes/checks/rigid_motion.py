@@ -38,7 +38,7 @@ def check_hold(scene: Scene, before: dict[str, int]) -> None:
 
 
 def check_held(scene: Scene) -> None:
-    """Raise InputError if a connected piece of the body has no sufficient support. Then no static solution exists."""
+    """Raise InputError if a connected piece of the body has a free rigid motion. Then no static solution exists."""
     loose = loose_piece(scene, lambda physics: physics.holds(scene.mesh))
     if loose:
         doubled = doubled_vertices(scene.mesh)
@@ -81,7 +81,7 @@ def loose_piece(scene: Scene, holds: Callable[[Physics], tuple[np.ndarray, np.nd
 def _rigid_rank(points: np.ndarray, directions: np.ndarray, size: float) -> int:
     """Return the rank of the six rigid motions of a body, projected on n fixed directions (n, 3) at points (n, 3).
 
-    The rank is 6 if the fixed directions prevent all rigid motions. `size` is the length of the body.
+    The rank is 6 if the fixed directions prevent all rigid motions. `size`: largest dimension of the body [m].
     """
     if not len(points):
         return 0

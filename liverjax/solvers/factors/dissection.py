@@ -14,8 +14,8 @@ import numpy as np
 #: LEAF: a group of at most this number of nodes is not divided. MANY: for a group of more nodes than this, diagonal
 #: planes and minimum cuts are also tried.
 LEAF, MANY = 40, 400
-#: LEAST: minimum fraction of the elements on each side of a plane. BESIDE: a minimum cut lies near its plane; on each
-#: side, it passes only through the elements nearest to the plane, which are this fraction of all elements.
+#: LEAST: minimum fraction of the elements on each side of a plane. BESIDE: a minimum cut lies near its plane. On
+#: each side, it passes only through the nearest elements, which are this fraction of all elements of the part.
 LEAST, BESIDE = 0.25, 0.07
 #: A minimum cut is used if its estimated work is below this fraction of the estimated work of the plane. Planes are
 #: preferred because they leave parts with straighter boundaries.
@@ -46,7 +46,7 @@ class _Cut(NamedTuple):
 
 
 def work(own: Any, border: Any) -> Any:
-    """Number of multiplications to eliminate `own` unknowns that are coupled with `border` other unknowns."""
+    """Return the number of multiplications to eliminate `own` unknowns, coupled with `border` other unknowns."""
     return own * (own * own / 3 + own * border + border * border)  # the operator ** would be slower
 
 
@@ -141,7 +141,7 @@ def _work_of_cuts(nodes: np.ndarray, part: _Part, span: tuple[np.ndarray, np.nda
 def _smallest_cuts(
     near: np.ndarray, nodes: np.ndarray, span: tuple[np.ndarray, np.ndarray], ends: tuple[int, int]
 ) -> list[np.ndarray]:
-    """Return, for the first and the last of all minimum cuts, which elements (h,) are on the first side.
+    """Return which elements (h,) are on the first side, for the first and for the last of all minimum cuts.
 
     Args:
         near: nodes (n, h) of the h elements from low to high - 1, in the order of the elements; n nodes each.

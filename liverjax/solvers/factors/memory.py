@@ -8,7 +8,7 @@ _FREE, _CONTAINER = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
 
 
 def free_memory() -> float:
-    """Memory [bytes] that this process can still allocate; infinite if the system does not report it."""
+    """Return the memory [bytes] that this process can still allocate; infinite if the system does not report it."""
     try:
         lines = dict(line.split(":") for line in _FREE.read_text().splitlines())
         free = 1024 * float(lines["MemAvailable"].split()[0])
@@ -20,7 +20,7 @@ def free_memory() -> float:
     try:
         limit, used = (float((_CONTAINER / f"memory.{name}").read_text()) for name in ("max", "current"))
         lines = dict(line.split() for line in (_CONTAINER / "memory.stat").read_text().splitlines())
-        # The system frees this part of the cache of files if a process needs memory.
+        # The system frees this part of the file cache if a process needs memory.
         return min(free, limit - used + float(lines.get("inactive_file", 0)))
     except (OSError, ValueError):  # the process is in no container, or the container has no limit ("max")
         return free

@@ -57,13 +57,13 @@ class Eliminated(NamedTuple):
     sizes: np.ndarray | None = None  # (n,) scale factor of each row of X; None: X is not stored as integers
 
     def times(self, y: np.ndarray) -> np.ndarray:
-        """Product X y (n,)."""
+        """Return the product X y (n,)."""
         if self.sizes is None:
             return self.X @ y
         return self.sizes * (self.X.astype(self.sizes.dtype).view(y.dtype) @ y)
 
     def transposed_times(self, y: np.ndarray) -> np.ndarray:
-        """Product X^T y (m,)."""
+        """Return the product X^T y (m,)."""
         if self.sizes is None:
             return y @ self.X
         return (self.sizes * y) @ self.X.astype(self.sizes.dtype).view(y.dtype)
@@ -108,21 +108,21 @@ def fronts(
 
 
 def _unknowns(nodes: np.ndarray, order: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Unknowns of the given nodes, ordered by node."""
+    """Return the unknowns of the given nodes, ordered by node."""
     first, number = ends[nodes], ends[nodes + 1] - ends[nodes]
     before = np.cumsum(number) - number
     return order[np.repeat(first - before, number) + np.arange(number.sum())]
 
 
 def single_bytes(plan: list[Front], kind: np.dtype) -> float:
-    """Memory [bytes] of a factor in single precision; `kind` is the type of the matrix entries, real or complex."""
+    """Return the memory [bytes] of a factor in single precision. `kind` is the type of the entries, real or complex."""
     own, border = (np.array([len(part) for part in parts], float) for parts in zip(*(f[:2] for f in plan), strict=True))
     together = np.minimum(own, PIVOTS)
     return float(np.sum(own * (0.5 * (own + together) + border))) * (8 if kind.kind == "c" else 4)
 
 
 def needed_bytes(plan: list[Front], kind: np.dtype, single: bool, small: bool) -> float:
-    """Memory [bytes] for an elimination in the order of the plan. Groups that run in parallel need more memory.
+    """Return the memory [bytes] for an elimination in the order of the plan. A parallel elimination needs more memory.
 
     This memory contains the factor, the matrix of one group, and the lower triangles that eliminated groups have left
     to their parent groups.
@@ -172,7 +172,7 @@ class _Elimination(NamedTuple):
     running: dict[Future, int]  # pieces in progress
 
     def idle(self) -> int:
-        """Number of cores that a piece may use: one core, plus all cores that work on no piece."""
+        """Return the number of cores that a piece may use: one core, plus all cores that work on no piece."""
         return max(1, cores() + 1 - len(self.running))
 
     def piece(self, groups: list[int]) -> None:
@@ -217,7 +217,7 @@ def _all_pieces(own: _Elimination) -> list[Eliminated]:
 
 
 def cores() -> int:
-    """Number of cores that the process may use."""
+    """Return the number of cores that the process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -267,7 +267,7 @@ def _scaled(A: Any) -> tuple[Any, np.ndarray]:
 
 
 def _own_columns(A: Any, front: Front, place: np.ndarray, memory: np.ndarray) -> np.ndarray:
-    """Columns (n + m, n) of A for the n unknowns of the group, with 0 above the diagonal. The border has m unknowns.
+    """Return the columns (n + m, n) of A for the n unknowns of a group with m border unknowns; 0 above the diagonal.
 
     The row of each unknown of the group and its border is written into `place`.
     """
@@ -363,7 +363,7 @@ def _in_whole_numbers(step: Eliminated) -> Eliminated:
 
 
 def _inverted(A: np.ndarray) -> np.ndarray:
-    """Inverse of a matrix that is not empty. Raises LinAlgError if the matrix is singular."""
+    """Return the inverse of a matrix that is not empty. Raise LinAlgError if the matrix is singular."""
     from scipy.linalg import get_lapack_funcs
 
     factor, invert = get_lapack_funcs(("getrf", "getri"), (A,))
@@ -392,7 +392,7 @@ def refined_solution(factor: Factor, b: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _backward_error(size: Any, x: np.ndarray, b: np.ndarray, out: np.ndarray) -> float:
-    """Backward error: the norm of `out` = b - A x, divided by the sum of the norms of |A| |x| and b."""
+    """Return the backward error: the norm of `out` = b - A x, divided by the sum of the norms of |A| |x| and b."""
     terms = np.linalg.norm(size @ abs(x)) + np.linalg.norm(b)
     return float(np.linalg.norm(out) / terms) if terms > 0 else 0.0
 
