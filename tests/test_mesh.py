@@ -74,6 +74,44 @@ def test_refined_meshes_fill_the_same_body():
     np.testing.assert_array_equal(twice.points, lj.quadratic(fine).points)
 
 
+def _quality(mesh):
+    """Return volume over (mean square edge length)^(3/2) of each element (E,), 1 for a regular tetrahedron."""
+    corners = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)]
+    edges = [np.sum((corners[:, i] - corners[:, j]) ** 2, axis=1) for i in range(4) for j in range(i)]
+    return np.asarray(mesh.volumes) * 6 * np.sqrt(2) / np.mean(edges, axis=0) ** 1.5
+
+
+def test_elements_do_not_become_flatter_with_each_refinement():
+    """The inner diagonal depended on the order of the corners, so that the worst element of a box lost half of its
+    quality with each refinement.
+    """
+    mesh = lj.shapes.box((1.0, 1.0, 1.0), (1, 1, 1))
+    whole = _quality(mesh)
+    for cells in (2, 4):
+        mesh = lj.refined(mesh)
+        np.testing.assert_allclose(_quality(mesh), whole[0], rtol=1e-12)
+        same = lj.shapes.box((1.0, 1.0, 1.0), (cells,) * 3)  # also the same elements as a box with smaller cells
+        a, b = (
+            {tuple(sorted(map(tuple, np.round(m.points[t], 9)))) for t in m.tetrahedra}
+            for m in map(_on_host, (mesh, same))
+        )
+        assert a == b
+    # Elements of any shape, in any order of their corners
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        points = rng.normal(size=(4, 3))
+        corners = rng.permutation(4)
+        positive = np.linalg.det(points[corners[1:]] - points[corners[0]]) > 0
+        one = lj.tet_mesh(points, corners[None] if positive else corners[[1, 0, 2, 3]][None])
+        first = lj.refined(one)
+        assert _quality(first).min() > 0.6 * _quality(one).min()
+        assert _quality(lj.refined(lj.refined(first))).min() > 0.9 * _quality(first).min()
+
+
+def _on_host(mesh):
+    return replace(mesh, points=np.asarray(mesh.points), tetrahedra=np.asarray(mesh.tetrahedra))
+
+
 @pytest.mark.parametrize("shape", ["box", "cylinder"])
 def test_meshes_refined_near_nodes_are_whole(shape):
     """Refined twice at the edge of a fixed face: faces match, the body is the same, elements keep their shape, and

@@ -103,7 +103,7 @@ def inside_column(mesh, stiffness):
 def test_a_vessel_is_cut_at_the_elements_of_the_refined_mesh(order):
     mesh = column(3, order).mesh
     own, fine = inside_column(mesh, SHEAR), refined(mesh)
-    again, parts = inside_column(fine, SHEAR), own.in_parts()
+    again, parts = inside_column(fine, SHEAR), own.in_parts(mesh)
     assert sorted(np.asarray(parts.element)) == sorted(np.asarray(again.element))
     lengths = [each.freeze(None, None)._lengths(of) for each, of in ((own, mesh), (parts, fine))]
     assert np.isclose(lengths[0].sum(), lengths[1].sum(), rtol=1e-12)

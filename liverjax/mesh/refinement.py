@@ -11,9 +11,15 @@ from liverjax.mesh.selection import boundary_triangles, check_nodes
 from liverjax.mesh.shape_functions import FACES
 from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
+#: Even permutations of the corners of an element. Each leads to a different inner diagonal (`corner_orders`).
+_ORDERS = np.array([[0, 1, 2, 3], [0, 2, 3, 1], [0, 3, 1, 2]])
+
 
 def refined(mesh: TetMesh, near: Indices | None = None) -> TetMesh:
     """Return the mesh with every tetrahedron cut into eight (Bey 1995). Quadratic elements stay quadratic.
+
+    Four parts lie at the corners of the element. The octahedron between them is cut at its shortest diagonal, so that
+    the elements do not become flatter with each refinement.
 
     The old vertices keep their numbers, and the middles of the edges follow in the order of `pattern.edges`. So the new
     vertices are the nodes of `quadratic(mesh)`, and a node set gets the same new nodes as in `quadratic(mesh)`. The
@@ -72,24 +78,32 @@ def places_in(mesh: TetMesh, fine: TetMesh) -> tuple[np.ndarray, np.ndarray]:
 
     Returns, for each node, an element (V',) that contains it, and its barycentric coordinates (4, V') in this element.
     """
+    orders = corner_orders(mesh)
     corners = _places_of_parts()
     inside = np.concatenate([corners, corners[:, [i for i, _ in PAIRS]] / 2 + corners[:, [j for _, j in PAIRS]] / 2], 1)
     own = fine.element_nodes_on_host  # (n, 8 E)
     _, first = np.unique(own, return_index=True)
     slot, part = np.unravel_index(first, own.shape)
-    return part // 8, inside[part % 8, slot].T
+    element, places = part // 8, np.empty((4, len(part)))
+    np.put_along_axis(places, orders[:, element], inside[part % 8, slot].T, axis=0)
+    return element, places
 
 
-def barycentric_in_parts(L: np.ndarray) -> np.ndarray:
+def barycentric_in_parts(mesh: TetMesh, element: Indices, L: np.ndarray) -> np.ndarray:
     """Return the barycentric coordinates (4, m, 8) of m points in the eight parts of their elements (`refined`).
 
-    `L` (4, m): barycentric coordinates of the points in their elements.
+    Args:
+        mesh: the mesh that is not refined.
+        element: numbers (m,) of the elements that contain the points.
+        L: barycentric coordinates (4, m) of the points in their elements.
     """
-    return np.einsum("kca,cm->amk", np.linalg.inv(_places_of_parts()), L)
+    ordered = np.take_along_axis(L, corner_orders(mesh)[:, np.asarray(element)], axis=0)
+    return np.einsum("kca,cm->amk", np.linalg.inv(_places_of_parts()), ordered)
 
 
 def _places_of_parts() -> np.ndarray:
-    """Return the barycentric coordinates (8, 4, 4) of the four corners of each part of an element."""
+    """Return the barycentric coordinates (8, 4, 4) of the four corners of each part, for ordered corners of the
+    element."""
     return _corners_of_parts(*np.eye(4), *(np.eye(4)[[i, j]].mean(axis=0) for i, j in PAIRS))
 
 
@@ -121,17 +135,42 @@ def rim(mesh: TetMesh, nodes: Indices) -> np.ndarray:
 def _eighths(mesh: TetMesh, middle: np.ndarray) -> np.ndarray:
     """Cut each element into eight, and return the new elements (8 E, 4). `middle` (N,): number of the node at the
     middle of each edge."""
-    parts = _corners_of_parts(*np.asarray(mesh.tetrahedra).T, *middle[np.asarray(mesh.pattern.element_edges)])
-    return parts.transpose(2, 0, 1).reshape(-1, 4)
+    orders = corner_orders(mesh)
+    corners = np.take_along_axis(np.asarray(mesh.tetrahedra).T, orders, axis=0)
+    slots = {pair: k for k, pair in enumerate(PAIRS)}
+    slot = np.array([[slots.get((min(i, j), max(i, j)), -1) for j in range(4)] for i in range(4)])
+    edges = np.stack([slot[orders[i], orders[j]] for i, j in PAIRS])
+    middles = middle[np.take_along_axis(np.asarray(mesh.pattern.element_edges), edges, axis=0)]
+    return _corners_of_parts(*corners, *middles).transpose(2, 0, 1).reshape(-1, 4)
+
+
+def corner_orders(mesh: TetMesh) -> np.ndarray:
+    """Return the order (4, E) of the four corners a, b, c, d in which each element is cut, as numbers from 0 to 3.
+
+    The inner diagonal joins the middles of the edges a c and b d. In this order it is the shortest of the three inner
+    diagonals. If the positions are unknown (inside jit, grad or vmap), the order is that of the mesh.
+    """
+    E = mesh.number_of_elements
+    if isinstance(mesh.points, jax.core.Tracer):
+        return np.tile(_ORDERS[0][:, None], E)
+    a, b, c, d = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)].transpose(1, 0, 2)
+    diagonals = np.linalg.norm([a + c - b - d, a + d - b - c, a + b - c - d], axis=2)
+    # Lengths are rounded, so that the choice between diagonals of equal length is the same on all machines.
+    relative = (diagonals / diagonals.max(axis=0)).astype(np.float32)
+    return _ORDERS[relative.argmin(axis=0)].T
 
 
 def _corners_of_parts(a: Array, b: Array, c: Array, d: Array, *middles: Array) -> np.ndarray:
-    """Return the corners (8, 4, …) of the eight parts of an element, from its corners a, b, c, d and edge middles."""
+    """Return the corners (8, 4, …) of the eight parts of an element, from its corners a, b, c, d and edge middles.
+
+    The order of the corners of each part is that of Bey, so that repeated refinement has at most three different shapes
+    of elements. Where this order has a negative volume, the first and the third corner are exchanged.
+    """
     ab, ac, ad, bc, bd, cd = middles
     return np.array(
         [
             *([a, ab, ac, ad], [ab, b, bc, bd], [ac, bc, c, cd], [ad, bd, cd, d]),
-            *([ab, ac, ad, bd], [ab, bc, ac, bd], [ac, ad, bd, cd], [ac, bc, cd, bd]),
+            *([ab, ac, ad, bd], [bc, ac, ab, bd], [ac, ad, bd, cd], [bd, bc, ac, cd]),
         ]
     )
 

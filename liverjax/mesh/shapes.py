@@ -37,7 +37,7 @@ def box(size: Sequence[float], cells: Sequence[int]) -> TetMesh:
     for order in itertools.permutations(range(3)):
         path = np.vstack([np.zeros(3, dtype=int), np.cumsum(np.eye(3, dtype=int)[list(order)], axis=0)])
         if np.linalg.det(np.eye(3)[list(order)]) < 0:
-            path = path[[0, 2, 1, 3]]
+            path = path[[2, 1, 0, 3]]
         nodes = corner[:, None, :] + path[None]
         sixths.append(np.ravel_multi_index(tuple(np.moveaxis(nodes, -1, 0)), shape))
     # The tetrahedra of one brick follow each other, so that neighbours in memory share nodes.

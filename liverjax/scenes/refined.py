@@ -95,7 +95,7 @@ def on_refined_mesh(scene: Scene) -> tuple[Scene, Within]:
         return load if triangles is None else replace(load, triangles=quarters(old, triangles))  # type: ignore[type-var]
 
     def attached(physics: Physics) -> Physics:
-        return physics.in_parts() if isinstance(physics, Vessel) else parts(physics.enriched(mesh, more))
+        return physics.in_parts(old) if isinstance(physics, Vessel) else parts(physics.enriched(mesh, more))
 
     body = scene.body
     if body is not None and jnp.ndim(body.density):

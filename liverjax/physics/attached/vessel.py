@@ -101,13 +101,14 @@ class Vessel(Physics):
             )
         layers.check(self.law, name)
 
-    def in_parts(self) -> "Vessel":
-        """Return the vessel on the refined mesh, where every element is cut into eight (`liverjax.mesh.refinement`).
+    def in_parts(self, mesh: TetMesh) -> "Vessel":
+        """Return the vessel on the refined mesh, where every element of `mesh` is cut into eight
+        (`liverjax.mesh.refinement`).
 
         The position of the vessel must be known (not inside jit).
         """
         m = len(np.asarray(self.element))
-        first, last = (barycentric_in_parts(np.asarray(L)) for L in (self.enters, self.leaves))
+        first, last = (barycentric_in_parts(mesh, self.element, np.asarray(L)) for L in (self.enters, self.leaves))
         cut = locate.cut_lines(first, last)
         begin, end = (each[:, cut.line, cut.element] for each in (first, last))
         enters, leaves = (begin + at * (end - begin) for at in (cut.begin, cut.end))
