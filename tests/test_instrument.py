@@ -30,6 +30,30 @@ def corrected(s: Sweep):
     return instrument.without_error_of_inertia(viscoelastic.closed_form(s, 2), s)
 
 
+def test_the_number_of_modes_is_chosen_again_with_the_error_of_the_inertia():
+    """An inertia that is 2 % too small made G' fall with the frequency. Two modes did not converge, one mode was kept,
+    and G0 was 802 ± 15 Pa. The warning about this was lost.
+    """
+    truth, omega = (
+        Maxwell(np.float64(1000.0), np.array([0.3, 0.2]), np.array([2.0, 0.02])),
+        2 * np.pi * np.logspace(-2, 0.45, 18),
+    )
+    share = 2e-5 * omega**2 / (np.pi * 0.01**4 / 2 / 0.004)  # [Pa] at most 1.6 times the modulus
+    rng = np.random.default_rng(31)
+    storage, loss = generalised_maxwell.moduli(truth, omega)
+    raw = storage + 1j * loss - 1.02 * share
+    raw = raw * (1 + 0.005 * rng.standard_normal(18)) * np.exp(0.005j * rng.standard_normal(18))
+    G = raw + share
+    s = Sweep(omega, G.real, G.imag, inertia=share)
+    chosen = viscoelastic.choose_modes(s, generalised_maxwell.spectrum(s))[0]
+    fit, _ = instrument.without_error_of_inertia(chosen, s)
+    assert (chosen.modes, fit.modes) == (1, 2)
+    told, u = fit.details["instrument"], fit.uncertainty
+    assert abs(told["inertia_off_by"] - 0.02) < 2 * told["standard_error"] < 0.03
+    assert abs(u.values[0] - 1000) < 2 * u.standard_errors[0] < 300
+    assert [row["modes"] for row in fit.details["modes_tried"]] == [1, 2, 3]
+
+
 def test_the_error_of_the_inertia_is_found_and_its_standard_error_is_right():
     off = 5e-4
     found = [corrected(sweep(off, seed))[0].details["instrument"] for seed in range(16)]

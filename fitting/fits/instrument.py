@@ -10,7 +10,7 @@ The friction b of the bearing adds b omega / K to G''. The error of b has a norm
 deviation that the user gives.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -85,6 +85,20 @@ class InstrumentErrors(NamedTuple):
         return np.abs(self.values - self.part) <= 2 * self.part_errors
 
 
+class Corrected(NamedTuple):
+    """Instrument errors that were fitted together with the modes: k errors, in standard deviations of their priors."""
+
+    values: np.ndarray  # (k,)
+    covariance: np.ndarray  # (k, k)
+    fit: Fit  # to the corrected moduli
+    found: bool  # False: the rounds of fit and correction did not converge
+
+    @property
+    def criterion(self) -> float:
+        """The Bayesian information criterion of the fit, plus that of the prior of the instrument errors."""
+        return viscoelastic.information_criterion(self.fit) + float(self.values @ self.values)
+
+
 def nuisances_of(sweep: Sweep) -> list[Nuisance]:
     """Return the errors of the instrument (inertia, friction) for which the sweep has data."""
     out = []
@@ -100,35 +114,86 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
 
     The fit and the sweep are returned unchanged if the sweep has no data of the instrument, or if the model has no free
     Prony modes. If one of the errors changes when the upper end of the band is left out, all errors are reported, but
-    the moduli are not corrected for them.
+    the moduli are not corrected for them. If the number of modes was chosen automatically, more modes are tried, too.
     """
     known = nuisances_of(sweep)
     if not known or fit.kind.values is not None or not isinstance(fit.solution.u, np.ndarray):
         return fit, sweep
     weighed = _with_noise_as_measured(sweep)
-    values, covariance, refitted, ended = _errors_of_instrument(_fitted_again(fit, weighed), weighed)
-    kept = sweep.angular_frequency < sweep.angular_frequency[-1] / HALF_DECADE * (1 - 1e-9)
-    part: tuple[Any, Any] = (None, None)
-    if len(np.unique(sweep.angular_frequency[kept])) > len(fit.solution.u) // 2 + 1:
-        shorter = some(weighed, kept)
-        found, of_part, _, also = _errors_of_instrument(viscoelastic.closed_form(shorter, fit.modes), shorter)
-        part = (found, np.sqrt(np.diag(of_part))) if also else part
-    errors = InstrumentErrors(values, covariance, *part, ended)
+    tried = [_errors_of_instrument(_fitted_again(fit, weighed), weighed), *_with_other_modes(fit, weighed)]
+    best = _with_lowest_criterion(tried, weighed)
+    errors = InstrumentErrors(best.values, best.covariance, *_of_part(best.fit, weighed), best.found)
     details = fit.details | {"instrument": instrument_numbers(errors, known)}
     if not errors.steady.all():
         return fit._replace(details=details, warnings=(*fit.warnings, *_not_corrected(errors, known))), sweep
-    corrected = _shifted(weighed, known, values)
-    notes = [
+    corrected = _shifted(weighed, known, best.values)
+    corrected = corrected._replace(notes=(*sweep.notes, *_corrections(known, best)))
+    refitted = best.fit._replace(details=details)
+    if viscoelastic.TRIED in details:
+        refitted = viscoelastic.beside_other_numbers(refitted, [own.fit for own in tried], corrected, {})
+    return refitted._replace(uncertainty=_with_directions(refitted, corrected, known, best.covariance)), corrected
+
+
+def _with_other_modes(fit: Fit, sweep: Sweep) -> list[Corrected]:
+    """Return the instrument errors with more modes. The list is empty if the user gave the number of modes.
+
+    If the inertia is wrong, a fit with enough modes may not converge, so too few modes are chosen at first.
+    """
+    if viscoelastic.TRIED not in fit.details:
+        return []
+    most = min(fit.modes + 2, viscoelastic.most_modes(sweep))
+    return [_from_several_starts(modes, sweep) for modes in range(fit.modes + 1, most + 1)]
+
+
+def _from_several_starts(modes: int, sweep: Sweep) -> Corrected:
+    """Return the instrument errors with this number of modes. If the search from 0 finds no fit whose modes the data
+    determine, it is repeated from errors of one standard deviation of the prior. A wrong inertia can make G' fall with
+    the frequency; a mode with a time near 0 then takes the place of the error.
+    """
+    known, found = nuisances_of(sweep), []
+    for start in (0.0, 1.0, -1.0):
+        values = np.eye(len(known))[0] * start
+        moved = _shifted(sweep, known, values)
+        if np.all(moved.storage > 0) and np.all(moved.loss > 0):
+            found.append(_errors_of_instrument(viscoelastic.closed_form(moved, modes), sweep, values))
+            if _of_determined_modes(found[-1], sweep):
+                return found[-1]
+    return found[0]
+
+
+def _of_determined_modes(own: Corrected, sweep: Sweep) -> bool:
+    return own.found and viscoelastic.identifiable(own.fit, sweep)
+
+
+def _with_lowest_criterion(tried: list[Corrected], sweep: Sweep) -> Corrected:
+    """Return the result with the lowest criterion, which contains the prior of the instrument errors. If no result has
+    only modes that the data determine, return the first result."""
+    return min(
+        (own for own in tried if _of_determined_modes(own, sweep)), key=lambda own: own.criterion, default=tried[0]
+    )
+
+
+def _of_part(fit: Fit, sweep: Sweep) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Return the instrument errors without the last half decade of the sweep, and their standard errors. Return (None,
+    None) if too few points are left, or if the errors are not found."""
+    kept = sweep.angular_frequency < sweep.angular_frequency[-1] / HALF_DECADE * (1 - 1e-9)
+    if len(np.unique(sweep.angular_frequency[kept])) <= len(fit.solution.u) // 2 + 1:
+        return None, None
+    shorter = some(sweep, kept)
+    part = _errors_of_instrument(viscoelastic.closed_form(shorter, fit.modes), shorter)
+    return (part.values, np.sqrt(np.diag(part.covariance))) if part.found else (None, None)
+
+
+def _corrections(known: list[Nuisance], best: Corrected) -> list[str]:
+    """Return a note on each instrument error for which the moduli are corrected, or which the data do not determine."""
+    return [
         f"the instrument's {n.name} is {n.compared(v)} (standard error {n.told(e)}, prior {n.told(1.0)}). The moduli "
         "are corrected for this error"
         if e < UNTOLD
         else f"the data do not determine the instrument's {n.name}: its standard error is {n.told(e)} with the data "
         f"and {n.told(1.0)} without the data, and the moduli contain this error"
-        for n, v, e in zip(known, values, np.sqrt(np.diag(covariance)), strict=True)
+        for n, v, e in zip(known, best.values, np.sqrt(np.diag(best.covariance)), strict=True)
     ]
-    corrected = corrected._replace(notes=(*sweep.notes, *notes))
-    spread = _with_directions(refitted, corrected, known, covariance)
-    return refitted._replace(details=refitted.details | details, uncertainty=spread), corrected
 
 
 def used_errors(fit: Fit, sweep: Sweep) -> tuple[list[Nuisance], np.ndarray]:
@@ -207,12 +272,16 @@ def _with_noise_as_measured(sweep: Sweep) -> Sweep:
     return sweep._replace(storage_sd=storage_sd, loss_sd=loss_sd, sd_before=True)
 
 
-def _errors_of_instrument(fit: Fit, sweep: Sweep) -> tuple[np.ndarray, np.ndarray, Fit, bool]:
-    """Return the k instrument errors (k,), their covariance, the fit to the corrected moduli, and whether the rounds of
-    fit and correction converged. Errors and covariance are in standard deviations of the priors.
+def _errors_of_instrument(fit: Fit, sweep: Sweep, values: np.ndarray | None = None) -> Corrected:
+    """Fit the instrument errors together with the modes, in rounds of a fit and a correction.
+
+    Args:
+        fit: fit to the moduli of the sweep after the correction by `values`.
+        sweep: the measured moduli.
+        values: instrument errors (k,) at the start; None: zeros.
     """
     known = nuisances_of(sweep)
-    values, covariance = np.zeros(len(known)), np.eye(len(known))
+    values, covariance = np.zeros(len(known)) if values is None else values, np.eye(len(known))
     for _ in range(ROUNDS):
         here = _shifted(sweep, known, values)
         J, r = np.asarray(fit.solution.jacobian), np.asarray(fit.solution.residuals)
@@ -227,8 +296,8 @@ def _errors_of_instrument(fit: Fit, sweep: Sweep) -> tuple[np.ndarray, np.ndarra
         values = values + step
         fit = _fitted_again(fit, _shifted(sweep, known, values))
         if np.all(np.abs(whole) < np.maximum(1e-3 * np.sqrt(np.diag(covariance)), SETTLED)):
-            return values, covariance, fit, True
-    return values, covariance, fit, False
+            return Corrected(values, covariance, fit, True)
+    return Corrected(values, covariance, fit, False)
 
 
 def _fitted_again(fit: Fit, sweep: Sweep) -> Fit:

@@ -282,6 +282,8 @@ def information_criterion(fit: Fit) -> float:
     return float(m * np.log(mean_square(fit)) + number_of_parameters(fit) * np.log(m))
 
 
+#: Key in `Fit.details` of the table of tried numbers of modes.
+TRIED = "modes_tried"
 #: A fit counts as exact if all its relative errors are below this value, because no data have so many digits.
 EXACT = 1e-7
 
@@ -299,7 +301,7 @@ def choose_modes(
     a number of modes raises an error, this counts as a failure too. A warning then names this number of modes, and the
     search continues with the other fits.
     """
-    cap = min(uncertainty.supported_modes(sweep), generalised_maxwell.largest_number_of_modes(sweep))
+    cap = most_modes(sweep)
     tried: list[Fit] = []
     broken: dict[int, str] = {}
     chosen, failures = None, 0
@@ -325,6 +327,25 @@ def choose_modes(
             break
     if chosen is None:
         raise InputError(f"{sweep.source or 'sweep'}: every fit failed (with 1 mode: {broken[1]}); check the data")
+    chosen = beside_other_numbers(chosen, tried, sweep, broken)
+    compiling, running = sum(f.compile_time for f in tried), sum(f.run_time for f in tried)
+    return chosen._replace(compile_time=compiling, run_time=running), tried
+
+
+def most_modes(sweep: Sweep) -> int:
+    """Return the largest number of modes that is tried for the sweep."""
+    return min(uncertainty.supported_modes(sweep), generalised_maxwell.largest_number_of_modes(sweep))
+
+
+def beside_other_numbers(chosen: Fit, tried: list[Fit], sweep: Sweep, broken: dict[int, str]) -> Fit:
+    """Return the chosen fit with a table of all tried numbers of modes in its details, and with warnings about a closer
+    fit that was not chosen and about fits that failed.
+
+    Args:
+        chosen, tried: the fits to the sweep.
+        sweep: the data.
+        broken: number of modes -> error message of its fit.
+    """
     table = [
         {
             "modes": f.modes,
@@ -334,15 +355,8 @@ def choose_modes(
         }
         for f in tried
     ]
-    return (
-        chosen._replace(
-            warnings=(*chosen.warnings, *_other_numbers(sweep, chosen, tried, broken)),
-            compile_time=sum(f.compile_time for f in tried),
-            run_time=sum(f.run_time for f in tried),
-            details=chosen.details | {"modes_tried": table},
-        ),
-        tried,
-    )
+    warnings = (*chosen.warnings, *_other_numbers(sweep, chosen, tried, broken))
+    return chosen._replace(warnings=warnings, details=chosen.details | {TRIED: table})
 
 
 def _other_numbers(sweep: Sweep, chosen: Fit, tried: list[Fit], broken: dict[int, str]) -> list[str]:

@@ -52,10 +52,11 @@ def with_short_times(fit: TimeFit, test: TimeTest) -> TimeFit:
     missing = fall * ratio / (1 - ratio) - (whole - G[0])
     if missing <= SHOWN * error:
         return fit
+    contained = "" if test.described else " (the total error contains this part)"
     told = (
         f"G0 may be {missing:.2g} Pa larger, if the modulus fell before {first:.3g} s in the same way as after this "
-        "time. The chosen modes do not contain this part (the total error contains this part): begin the record "
-        "earlier, or compare with --model auto"
+        f"time. The chosen modes do not contain this part{contained}: begin the record earlier, or compare with "
+        "--model auto"
     )
     return fit._replace(warnings=(*fit.warnings, told), details=fit.details | {MISSING: float(missing)})
 
