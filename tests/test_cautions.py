@@ -166,7 +166,12 @@ def test_waves_without_a_mass_are_told():
     (said,) = cautions_of_waves(heavy)
     wave = np.sqrt(float(heavy.law.shear_modulus()) / 1060.0) / 60
     assert said.startswith(f"at 60 Hz shear waves are about {wave:.2g} m long")
-    assert cautions_of_waves(replace(heavy, solve=replace(heavy.solve, frequencies=np.array([1.0])))) == []
+    slow = replace(heavy, solve=replace(heavy.solve, frequencies=np.array([1.0])))
+    assert cautions_of_waves(slow) == []
+    # A soft region has shorter waves.
+    soft = lj.Region(elements=np.array([0, 1]), law={"mu": 1e-4 * float(heavy.law.shear_modulus())})
+    (said,) = [s for s in cautions_of_waves(replace(slow, region=(soft,))) if "shear waves" in s]
+    assert said.startswith(f"at 1 Hz shear waves are about {0.6 * wave:.2g} m long")
 
 
 SCENE = """

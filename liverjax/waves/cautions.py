@@ -6,6 +6,7 @@ import numpy as np
 from liverjax.core.errors import InputError
 from liverjax.physics.attached.ligament import Ligament
 from liverjax.physics.contact.obstacle import Obstacle, touches_without_pressure
+from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene import Scene, named_physics
 from liverjax.simulation.cautions import cautions_of_mesh, of_drained_layer, of_locking
 
@@ -50,15 +51,21 @@ def cautions_of_waves(scene: Scene, about: jax.Array | None = None) -> list[str]
 
 
 def _of_short_waves(scene: Scene, hertz: float) -> list[str]:
-    """Return a warning if the shear waves of the elastic body at this frequency [Hz] are too short for the elements."""
+    """Return a warning if the shear waves of the elastic body at this frequency [Hz] are too short for the elements.
+
+    The sizes in the warning are those of the part of the body with the lowest shear modulus.
+    """
     if scene.body is None:
         return []
     try:
-        shear = float(np.median(np.asarray(scene.law.shear_modulus())))
+        moduli = np.asarray(by_element(scene).law.shear_modulus(), float)
     except InputError:  # a law may have no moduli
         return []
-    low, high = np.asarray(scene.mesh.points)[np.asarray(scene.mesh.pattern.edges)]
-    edge = float(np.median(np.linalg.norm(high - low, axis=1)))
+    moduli = np.broadcast_to(np.ravel(moduli), scene.mesh.number_of_elements)
+    corners = np.asarray(scene.mesh.points)[np.asarray(scene.mesh.tetrahedra)]
+    edges = np.linalg.norm(corners[:, [0, 0, 0, 1, 1, 2]] - corners[:, [1, 2, 3, 2, 3, 3]], axis=2)
+    softest = moduli <= moduli.min() * (1 + 1e-9)
+    edge, shear = float(np.median(edges[softest])), float(moduli.min())
     length = float(np.sqrt(shear / np.median(np.asarray(scene.body.density)))) / hertz
     if length >= _LEAST_PER_WAVE * edge:
         return []

@@ -97,8 +97,10 @@ def harmonic_errors(
 def _richer_elements(scene: Scene) -> Scene:
     rich = enriched(scene)
     if rich.mesh.order == 3:
-        # Cubic elements do not lock, so they need no special treatment of the volume.
-        return replace(rich, solve=replace(rich.solve, volumetric="element"))
+        # Cubic elements do not lock. If the pressures of quadratic elements are unknowns, they stay unknowns. The
+        # estimate would otherwise contain the different treatment of the volume, and be a third too small.
+        volumetric = "mixed" if scene.solve.volumetric == "mixed" else "element"
+        return replace(rich, solve=replace(rich.solve, volumetric=volumetric))
     if scene.solve.volumetric == "nodal":
         return replace(rich, solve=replace(rich.solve, volumetric="mixed"))
     return rich
