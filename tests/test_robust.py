@@ -8,8 +8,9 @@ import pytest
 import liverjax as lj
 from liverjax import laws
 from liverjax.core import status
-from liverjax.core.struct import replace
+from liverjax.core.struct import param, replace, static, struct
 from liverjax.elements import projection
+from liverjax.laws.base import Volumetric
 from liverjax.laws.terms import invariant_terms
 from liverjax.mesh import shapes
 from liverjax.scenes.scene_file import scene_from
@@ -129,6 +130,26 @@ def test_a_continued_law_is_finite_and_smooth(gradients, law):
         (below, over), (P_below, P_over) = longer.energy(F), longer.first_piola(F)
         scale = np.abs(P_over).max()
         assert abs(over - below) < 10 * h * scale and np.abs(P_over - P_below).max() < 100 * h * scale
+
+
+def test_a_volumetric_energy_is_continued_once(gradients):
+    """A law with only a volumetric energy U(J), and a law that cannot be split, had U(J) twice."""
+
+    @struct
+    class Whole(laws.Law):
+        bulk: float = param("Pa", typical=2000.0)
+        volumetric: str = static("quadratic")
+        invariants = ("I1", "J")
+
+        def strain_energy(self, I):
+            return 350.0 * (I.J ** (-2 / 3) * I.I1 - 3) + 0.5 * self.bulk * (I.J - 1) ** 2
+
+    one = laws.continued(laws.NeoHookean(mu=700.0, bulk=2000.0), 0.3)
+    two = laws.continued(laws.NeoHookean(mu=700.0, bulk=None) + Volumetric(bulk=2000.0), 0.3)
+    assert np.allclose(two.energy(gradients), one.energy(gradients), rtol=1e-12)
+    above = gradients[np.asarray(jnp.linalg.det(gradients)) > 0.3]
+    whole = Whole(bulk=2000.0)
+    assert np.allclose(laws.continued(whole, 0.3).energy(above), whole.energy(above), rtol=1e-12)
 
 
 def test_a_scene_file_continues_its_law_and_keeps_its_names():

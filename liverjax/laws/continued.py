@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Number, static, struct, unnamed
+from liverjax.core.struct import Number, replace, static, struct, unnamed
 from liverjax.laws.base import Law, Volumetric
 from liverjax.tensors.matrices import determinant
 
@@ -32,8 +32,8 @@ class Continued(Law):
         return None if part is None else Continued(law=part, below=self.below)
 
     def volumetric_part(self) -> Law | None:
-        """Return the continued volumetric energy. Returns None if the original law has no volumetric energy."""
-        part = self.law.volumetric_part()
+        """Return the continued volumetric energy, or None if the original law has no separate volumetric energy."""
+        part = None if self.law.isochoric_part() is None else self.law.volumetric_part()
         return None if part is None else Volumetric(bulk=part.bulk, volumetric=part.volumetric, below=self.below)
 
     def without_volume(self) -> Law | None:
@@ -115,5 +115,8 @@ def continued(law: Law, below: float) -> Law:
                     f"law continued_below needs an energy of I1, I2 and J, but {type(part).__name__} has an energy of "
                     f"{kind}: remove continued_below"
                 )
-    first, *others = (Continued(law=part, below=float(below)) for part in law.summands())
+    first, *others = (
+        replace(part, below=float(below)) if isinstance(part, Volumetric) else Continued(law=part, below=float(below))
+        for part in law.summands()
+    )
     return sum(others, first)

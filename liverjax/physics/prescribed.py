@@ -105,5 +105,6 @@ def given_acceleration(place: Callable[[Number], jax.Array], k: Number, steps: i
     now, before = x[0] - 2 * x[1] + x[2], x[1] - 2 * x[2] + x[3]
     # For n = 1, `before` contains the jump of the velocity at the beginning, so it is not used.
     change = jnp.where(n > 1, now - before, 0.0) if steps > 2 else jnp.zeros_like(now)
-    begin = jnp.where(k == 0, 2.0, 1.0)
+    # In a run of one step, the step k = 1 would contain the same jump once more.
+    begin = jnp.where(k == 0, 2.0, 1.0 if steps > 1 else 0.0)
     return (begin * now + (k - n) * change) / dt**2

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from liverjax.core import status
 from liverjax.reduced.model import ReducedModel
 from liverjax.reduced.run import reduced_positions, simulate_reduced
 from liverjax.scenes.scene import Scene, with_parameters
@@ -36,7 +37,7 @@ def reduced_bias(
 
     Raises:
         InputError: `simulate_reduced` cannot run this scene.
-        RuntimeError: the full run does not converge.
+        RuntimeError: the full run or the reduced run does not converge.
     """
     flat, shaped = ravel_pytree({name: jnp.asarray(value, float) for name, value in values.items()})
 
@@ -44,6 +45,10 @@ def reduced_bias(
         own = with_parameters(scene, shaped(numbers))
         return jnp.ravel(observed(reduced_positions(model, own, simulate_reduced(model, own))))
 
+    run = jax.jit(simulate_reduced)(model, with_parameters(scene, shaped(flat)))
+    failed = np.flatnonzero(np.asarray(run.status) != status.CONVERGED)
+    if failed.size:
+        raise RuntimeError(f"the reduced run did not converge in step {failed[0] + 1}: use the full model")
     full = simulate(with_parameters(scene, shaped(flat))).check()
     off = np.asarray(jnp.ravel(observed(full.positions)) - jax.jit(answer)(flat))
     J = np.asarray(jax.jit(jax.jacfwd(answer))(flat))

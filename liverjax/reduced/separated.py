@@ -96,7 +96,7 @@ def separate(
     at = {name: jnp.asarray(between[:, k]) for k, name in enumerate(names)}
     off = np.linalg.norm(np.asarray(jax.vmap(lambda p: separated_displacement(found, p))(at)) - unseen, axis=-1)
     largest = np.linalg.norm(unseen, axis=-1).max(axis=1)
-    return replace(found, error=jnp.asarray(off.max(axis=1) / largest))
+    return replace(found, error=jnp.asarray(off.max(axis=1) / np.where(largest > 0, largest, 1.0)))
 
 
 def separated_displacement(model: SeparatedModel, values: Mapping[str, Any]) -> jax.Array:

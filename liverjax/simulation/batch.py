@@ -82,7 +82,7 @@ def simulate_batch(
         return jax.lax.map(run, values) if strategy == "map" else jax.vmap(run)(values)
 
     number = min(len(devices), lanes)
-    if number > 1:
+    if number > 1 or devices[0] != jax.local_devices()[0]:
         # The last parameter set is repeated until all devices have the same number of runs.
         fill = -lanes % number
         parameters = {n: jnp.concatenate([v, jnp.repeat(v[-1:], fill, axis=0)]) for n, v in parameters.items()}
@@ -91,7 +91,7 @@ def simulate_batch(
         specs = (PartitionSpec(), spread)
         part = jax.shard_map(part, mesh=mesh, in_specs=specs, out_specs=spread, check_vma=False)
     found = part(scene, parameters)
-    result, reference = jax.tree.map(lambda a: a[:lanes], found) if number > 1 else found
+    result, reference = jax.tree.map(lambda a: a[:lanes], found)
     return Batch(result=result, reference=reference, strategy=strategy, devices=number)
 
 
