@@ -235,6 +235,11 @@ def test_curves_of_any_encoding_are_read_below_their_title(encoding, tmp_path):
     [
         ("", "is empty"),
         ("a,b\n1,2\n", "has columns a, b"),
+        ("test,strain,nominal_stress_kPa\nuniaxial,0.1,2\n", "for the column strain: stretch = 1 + strain"),
+        (
+            "test,Strain (%),shear,nominal_stress_kPa\nuniaxial,1,,2\n",
+            "for the column Strain (%): stretch = 1 + strain",
+        ),
         ("test,stretch,nominal_stress_kPa\nbending,1,2\n", "'bending' is not known"),
         ("test,stretch,nominal_stress_kPa\nuniaxial,1,x\nuniaxial,2,3\nuniaxial,3,3\n", "'x' is not a number"),
         ("test,stretch,nominal_stress_kPa\nuniaxial,1,inf\nuniaxial,2,3\nuniaxial,3,3\n", "not finite"),

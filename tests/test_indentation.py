@@ -135,6 +135,9 @@ def test_the_command_reads_units_and_leaves_the_unloading_out(tmp_path, capsys):
     ("text", "more", "words"),
     [
         ("a,b\n1,2\n", [], "no header names depth and force"),
+        ("depth,force\n1,2\n", [], "no header names depth and force"),
+        ("Depth (mm),Load (gf)\n1,2\n", [], "unit 'gf' of 'Load (gf)' is not known; use N, mN, uN, nN, pN"),
+        ("depth_mil;force_N\n1;2\n", [], "unit 'mil' of 'depth_mil' is not known; use m, mm, um, nm"),
         ("depth_m,force_N\n0,0\n1e-4,x\n", [], "line 3: 'x' is not a finite number"),
         ("depth_m,force_N\n0,0\n1e-4,1\n", [], "the loading has 2 points"),
         ("depth_m,force_N\n" + "".join(f"-{k}e-5,-{k}e-3\n" for k in range(8)), [], "so change its sign"),

@@ -206,6 +206,30 @@ def test_a_hyphen_between_words_is_no_sign(tmp_path, name, celsius):
     assert np.allclose(data.temperatures - 273.15, [celsius, 40])
 
 
+def write_constant_rows(path, temperatures) -> None:
+    rows = [f"{f},{1000 + f},{100 + f},{T}\n" for T in temperatures for f in (1, 2, 3)]
+    path.write_text("frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,temperature_C\n" + "".join(rows))
+
+
+@pytest.mark.parametrize("files", [1, 5])
+def test_close_temperatures_are_no_chain(tmp_path, files):
+    """Sweeps at 20, 20.9, 21.8 and 22.7 °C were joined, because each differs from the next by less than 1 K."""
+    temperatures, paths = (20.0, 20.9, 21.8, 22.7, 30.0), []
+    for k, own in enumerate(np.array_split(temperatures, files)):
+        paths.append(tmp_path / f"{k}.csv")
+        write_constant_rows(paths[-1], own)
+    data = temperature_sweeps.read_temperatures(paths)
+    assert np.allclose(data.temperatures - 273.15, [20.45, 22.25, 30.0])
+
+
+def test_scattered_temperatures_that_count_as_one_are_told(tmp_path):
+    rows = [f"{f},{1000 + f},{100 + f},{T + 0.3 * f}\n" for T in (20, 30) for f in (1, 2, 3, 4, 5)]
+    (tmp_path / "a.csv").write_text("frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,temperature_C\n" + "".join(rows))
+    data = temperature_sweeps.read_temperatures([tmp_path / "a.csv"])
+    assert np.allclose(data.temperatures - 273.15, [20.9, 30.9])
+    assert "rows from 20.3 to 21.5 °C count as one temperature, 20.9 °C" in data.sweeps[0].notes[-1]
+
+
 @pytest.mark.draws
 def test_the_command_shifts_several_files_and_fits_the_curve(tmp_path, capsys):
     paths = []
@@ -259,7 +283,7 @@ def test_a_sweep_at_several_temperatures_that_fits_nothing_gets_the_remedy(tmp_p
         (
             "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,temperature_C\n1,2,1,20\n2,3,1,20\n3,4,1,20\n",
             [],
-            "two or more temperatures, but all sweeps are at 20",
+            "all sweeps are at 20 °C (rows less than 1 K apart count as one temperature)",
         ),
         (
             "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,temperature_C\n"

@@ -10,8 +10,10 @@ import scipy.stats
 from conftest import SHARED
 
 from fitting.__main__ import main
+from fitting.fits import samples
 from fitting.fits.samples import outliers
 from fitting.methods.population import population
+from fitting.readers.frequency_sweep import Sweep
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -148,6 +150,34 @@ def test_a_sample_that_is_not_of_the_others_is_named():
         )
         said = outliers(found)
         assert len(said) == told and all(s.startswith("s4.csv: its shear_modulus is 4.9 times") for s in said)
+
+
+def solid(equilibrium, omega, seed):
+    """Return a sweep with three modes, an equilibrium modulus [Pa] and 1 % of noise."""
+    rng, x = np.random.default_rng(seed), 1j * omega[:, None] * [0.03, 0.3, 3.0]
+    G = equilibrium + (x / (1 + x)) @ [1000.0, 700.0, 500.0]
+    moduli = (part * (1 + 0.01 * rng.standard_normal(len(omega))) for part in (G.real, G.imag))
+    return Sweep(omega, *moduli, source=f"s{seed}.csv")
+
+
+def test_the_order_of_the_samples_does_not_change_the_population():
+    """A first sample without an equilibrium modulus removed this modulus from the population and from the typical
+    sample.
+    """
+    omega = np.geomspace(0.1, 100, 16)
+    sweeps = [solid(G, omega, k) for k, G in enumerate((0.0, 100.0, 150.0, 120.0))]
+    first, last = samples.fit(sweeps, "spectrum"), samples.fit(sweeps[::-1], "spectrum")
+    assert first.fits[0].kind.names[0] != "equilibrium_modulus" and list(first.populations) == list(last.populations)
+    assert np.isclose(first.populations["equilibrium_modulus"].mean, last.populations["equilibrium_modulus"].mean)
+    found = [float(own.typical.equilibrium_modulus) for own in (first, last)]
+    assert found[0] > 50 and np.isclose(*found)
+
+
+def test_a_sample_of_two_frequencies_allows_the_small_models():
+    """The lists of models had different lengths, which raised an error of `zip`."""
+    sweeps = [solid(100.0, np.geomspace(0.1, 100, n), n) for n in (8, 2)]
+    found = samples.fit(sweeps, "fractional")
+    assert {row["model"] for row in found.compared} == {"springpot", "fractional_kelvin_voigt"}
 
 
 def samples_of(rows):

@@ -1,6 +1,7 @@
 """Phase velocity and attenuation of shear waves: formulas, files, and fits together with other tests."""
 
 import json
+from types import SimpleNamespace
 
 import mpmath
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from fitting.__main__ import main
 from fitting.commands import sweep as sweep_command
+from fitting.commands import together as together_command
 from fitting.fits import together
 from fitting.methods import generalised_maxwell
 from fitting.methods.generalised_maxwell import Maxwell
@@ -143,6 +145,32 @@ def test_bad_files_are_refused(tmp_path, text, words):
     (tmp_path / "w.csv").write_text(text)
     with pytest.raises(InputError, match=words):
         dispersion.read_dispersion(tmp_path / "w.csv")
+
+
+@pytest.mark.parametrize(
+    ("heading", "factor"), [("frequency", 2 * np.pi), ("angular_frequency", 1.0), ("angular_frequency_Hz", 2 * np.pi)]
+)
+def test_the_heading_of_the_frequency_alone_gives_its_unit(tmp_path, heading, factor):
+    """A column of angles made 50 Hz to 50 rad/s, without a message."""
+    (tmp_path / "w.csv").write_text(f"{heading},velocity,angular_position\n50,1.5,9\n60,1.6,9\n70,1.7,9\n")
+    found = dispersion.read_dispersion(tmp_path / "w.csv", 1000.0)
+    assert np.allclose(found.angular_frequency, factor * np.array([50.0, 60.0, 70.0]))
+
+
+def test_the_structure_of_velocities_and_attenuations_is_tested_separately():
+    """Residuals of the attenuation that change sign in every row hid a structured misfit of the velocity."""
+    own = waves(0.0)
+    signs = np.concatenate([np.repeat([1.0, -1.0], 6), np.tile([1.0, -1.0], 6)])
+    fit = SimpleNamespace(tests=[own], fitted=[own.measured * (1 + 0.01 * signs)])
+    (told,) = together.structured(fit)
+    assert "waves.csv (velocity): the residuals change sign only 1 times in 12 values" in told
+
+
+def test_the_inertia_that_stays_in_the_sweeps_is_told_beside_waves(capsys):
+    """With shear waves, --density without --height left the inertia in the sweep without a note."""
+    tests = [sweep(0.0), waves(0.0)]
+    assert together_command._without_sample_inertia(tests, 1060.0, None) == tests
+    assert "--density without --height subtracts no inertia" in capsys.readouterr().err
 
 
 def test_waves_are_cut_to_the_band_as_sweeps_are():

@@ -102,8 +102,6 @@ def without_instrument_or_sample(options: argparse.Namespace, sweep: "Sweep") ->
     """Return the sweep without the points at which the instrument dominates. The moduli still contain the inertia of
     the sample. If density and height of the sample are given, these points are searched in moduli without the inertia
     of the sample. So this inertia is not mistaken for the inertia of the instrument."""
-    import numpy as np
-
     from fitting.fits import sample_inertia
     from fitting.methods import kramers_kronig
     from fitting.readers.rheometer import some

@@ -48,13 +48,10 @@ def _without_sample_inertia(tests: "list[Measured]", density: float | None, heig
     sample are given."""
     from fitting.fits import sample_inertia
     from fitting.readers.frequency_sweep import Sweep
-    from fitting.waves.dispersion import Dispersion
 
     if density is None:
         return tests
     if height is None:
-        if any(isinstance(t, Dispersion) for t in tests):  # the waves need the density
-            return tests
         print(
             "note: --density without --height subtracts no inertia from the sweeps: give the height of the sample [m]",
             file=sys.stderr,

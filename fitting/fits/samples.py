@@ -77,8 +77,9 @@ def fit(
         tried += _modes_for_all(sweeps, dense, modes, progress)
     if model in ("fractional", "auto"):
         progress("springpots")
-        for fits in zip(*(models.fractional(s) for s in sweeps), strict=True):
-            tried.append(_candidate_for_all(sweeps, list(fits), {"model": fits[0].kind.name}))
+        every = [{f.kind.name: f for f in models.fractional(s)} for s in sweeps]
+        for name in (n for n in every[0] if all(n in own for own in every)):  # a few points allow only small models
+            tried.append(_candidate_for_all(sweeps, [own[name] for own in every], {"model": name}))
     if model in ("spectrum", "auto"):
         progress("spectrum")
         found = relaxation_spectrum.fit_all(sweeps)
@@ -138,7 +139,8 @@ def values_of_sample(fit: Fit) -> dict[str, tuple[float, float]]:
 def _populations(fits: list[Fit]) -> dict[str, Population | None]:
     known, out = [values_of_sample(f) for f in fits], {}
     names = sorted({n for row in known for n in row if "[" in n}, key=lambda n: (n.split("[")[0], _place(n)))
-    for name in (*(n for n in known[0] if "[" not in n), *names):
+    # The spectrum of the first sample may have no equilibrium modulus.
+    for name in (*dict.fromkeys(n for row in known for n in row if "[" not in n), *names):
         pairs = np.array([row.get(name, (0.0, np.inf)) for row in known])
         found = population(pairs[:, 0], pairs[:, 1])
         if found is not None and name.startswith("ratios["):  # a ratio cannot exceed 1

@@ -429,14 +429,19 @@ def missed(shares: list[Share]) -> list[str]:
 
 
 def structured(fit: Together) -> list[str]:
-    """Return a warning for each test (in a sweep, for each of G' and G'') whose residuals change sign too rarely."""
+    """Return a warning for each series of residuals that changes sign too rarely. A sweep has two series, G' and G''.
+    Shear waves have two if the attenuation was measured."""
     out = []
     for test, fitted in zip(fit.tests, fit.fitted, strict=True):
         residuals = fitted - reported_numbers(test)[1]
-        parts = np.split(residuals, 2) if isinstance(test, Sweep) else [residuals]
+        names = [""]
+        if isinstance(test, Sweep):
+            names = [" (G')", " (G'')"]
+        elif isinstance(test, Dispersion) and test.attenuation is not None:
+            names = [" (velocity)", " (attenuation)"]
         if np.max(np.abs(residuals) / sizes_of(test)) <= viscoelastic.EXACT:
             continue
-        for part, what in zip(parts, (" (G')", " (G'')") if len(parts) == 2 else ("",), strict=True):
+        for part, what in zip(np.split(residuals, len(names)), names, strict=True):
             runs, chance = kramers_kronig.runs_probability(part)
             if chance < kramers_kronig.CHANCE:
                 out.append(

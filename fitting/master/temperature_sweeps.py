@@ -1,5 +1,6 @@
 """Read sweeps of one material at several temperatures from one or several files."""
 
+import itertools
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitting.readers.frequency_sweep import Sweep, some
+from fitting.readers.frequency_sweep import FEWEST, Sweep, some
 from fitting.readers.rheometer import REPEATED, SORTED, read_all_sweeps
 from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
@@ -40,21 +41,33 @@ def read_temperatures(paths: Sequence[Path]) -> AtTemperatures:
         for name, sweep in read_all_sweeps(path):
             parts += _by_temperature(str(path), name, sweep)
     parts.sort(key=lambda part: part[0])
-    groups: list[list[tuple[float, float, Sweep]]] = []
-    for part in parts:
-        if groups and part[0] - groups[-1][-1][0] < SAME:
-            groups[-1].append(part)
-        else:
-            groups.append([part])
+    group = _index_of_group(np.array([part[0] for part in parts]), exact=True)
+    groups = [[parts[k] for k in np.flatnonzero(group == g)] for g in range(group.max() + 1)]
     if len(groups) < 2:
         raise InputError(
             f"{paths[0]}: --master needs sweeps at two or more temperatures, but all sweeps are at "
-            f"{celsius(parts[0][0]):.4g} °C; give a file with several tables, or several files"
+            f"{celsius(parts[0][0]):.4g} °C (rows less than {SAME:g} K apart count as one temperature); give a file "
+            "with several tables, or several files"
         )
     factors = np.array([float(np.exp(np.mean([np.log(p[1]) for p in g]))) for g in groups])
     means = np.array([float(np.mean([p[0] for p in g])) for g in groups])
     known = np.isfinite(factors).all()
     return AtTemperatures([joined([p[2] for p in g]) for g in groups], means, factors if known else None)
+
+
+def _index_of_group(T: np.ndarray, exact: bool) -> np.ndarray:
+    """Return for each temperature (n,) [K] the index (n,) of its group, in ascending order of the temperatures.
+
+    Exact temperatures that are `SAME` or more above the lowest one of a group begin the next group. Measured
+    temperatures scatter around an unknown value, so they begin the next group only after a gap of `SAME` or more.
+    """
+    order = np.argsort(T, kind="stable")
+    group, count, lowest = np.zeros(len(T), int), 0, T[order[0]]
+    for before, k in itertools.pairwise(order):
+        if T[k] - (lowest if exact else T[before]) >= SAME:
+            count, lowest = count + 1, T[k]
+        group[k] = count
+    return group
 
 
 def joined(sweeps: Sequence[Sweep]) -> Sweep:
@@ -88,9 +101,8 @@ def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, flo
         T = np.full(len(sweep.storage), float(stated[1].replace(",", ".")) + 273.15 * (stated[2] == "C"))
     if np.any(T <= 0):
         raise InputError(f"{path}: a temperature of {celsius(T.min()):.4g} °C is below absolute zero; check the unit")
-    order = np.argsort(T, kind="stable")
-    group = np.empty(len(T), int)
-    group[order] = np.concatenate([[0], np.cumsum(np.diff(T[order]) >= SAME)])
+    # If each temperature occurs in as many rows as a sweep needs, the column contains set temperatures.
+    group = _index_of_group(T, exact=bool(np.unique(T, return_counts=True)[1].min() >= FEWEST))
     factors = raw.get("shift_factor", np.full(len(T), np.nan))
     if np.any(factors <= 0):
         raise InputError(
@@ -108,5 +120,14 @@ def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, flo
         repeated = len(own.angular_frequency) - len(np.unique(own.angular_frequency))
         if repeated and group.max() > 0:
             own = own._replace(notes=(*own.notes, f"repeated frequencies: {repeated}. {REPEATED}"))
+        if np.ptp(T[mine]) >= SAME:
+            low, high, mean = (celsius(f(T[mine])) for f in (np.min, np.max, np.mean))
+            own = own._replace(
+                notes=(
+                    *own.notes,
+                    f"rows from {low:.4g} to {high:.4g} °C count as one temperature, {mean:.4g} °C, because the "
+                    f"temperatures between them are less than {SAME:g} K apart",
+                )
+            )
         out.append((float(np.mean(T[mine])), factor, own))
     return out

@@ -150,6 +150,8 @@ def _of_faults(curve: Curve) -> list[str]:
     ]
 
 
+#: Headings of a column of strains.
+_STRAIN = re.compile(r"(?i)strain([ _]*[\[(]?(%|percent|-|1|mm/mm)[\])]?)?$")
 #: Headings of columns that are read.
 _USED = re.compile(r"(?i)(F|P)[1-3]{2}|(test|stretch|shear)$|nominal_stress")
 
@@ -181,7 +183,7 @@ def _rows_of_curves(file: Path) -> tuple[list[dict[str, str]], list[tuple[int, s
     if not _names_curves(names):
         raise InputError(
             f"{file} has columns {', '.join(names)[:100]}: give F11 … F33, P11 … P33, "
-            "or test, stretch, shear, nominal_stress_kPa"
+            f"or test, stretch, shear, nominal_stress_kPa{_of_strains(names)}"
         )
     return rows, [(k + 1, own) for k, own in summaries.items()]
 
@@ -227,6 +229,14 @@ def _names_curves(headings: list[str]) -> bool:
     return "F11" in names or ("test" in names and bool({"stretch", "shear"} & set(names)))
 
 
+def _of_strains(headings: list[str]) -> str:
+    """Return words for the end of a message: how a column of strains, if there is one, becomes a column `stretch`."""
+    strain = next((name for name in headings if _STRAIN.match(name)), None)
+    if strain is None:
+        return ""
+    return f"; for the column {strain}: stretch = 1 + strain (1.02 for 2 %), and in simple shear, shear = strain"
+
+
 def _with_point(cell: str, between: str, sign: str | None) -> str:
     """Return a cell with a number in Python's notation. Any other cell is returned unchanged."""
     value = to_number(cell, between, sign) if cell else None
@@ -236,8 +246,11 @@ def _with_point(cell: str, between: str, sign: str | None) -> str:
 def _column(file: Path, rows: list[dict], name: str, default: float | None = None) -> np.ndarray:
     values = []
     if name not in rows[0] and default is None:
-        headings = ", ".join(key for key in rows[0] if key != "row")
-        raise InputError(f"{file} has no column {name}, only {headings}: add this column, without a unit")
+        headings = [key for key in rows[0] if key != "row"]
+        of_strains = _of_strains(headings) if name == "stretch" else ""
+        raise InputError(
+            f"{file} has no column {name}, only {', '.join(headings)}: add this column, without a unit{of_strains}"
+        )
     for row in rows:
         text = row.get(name, "")
         if not text and default is not None:

@@ -60,7 +60,9 @@ def read_indentation(path: str | Path) -> IndentationCurve:
     lines = text_of(Path(path), "an indentation curve").splitlines()
     head = next((k for k, line in enumerate(lines) if len(_depth_and_force(lines, k)) == 2), None)
     if head is None:
-        raise InputError(f"{path}: no header names depth and force with units; write depth_mm,force_mN above the rows")
+        unknown = next((words for words in map(_told_of_unknown_unit, lines) if words), None)
+        missing = "no header names depth and force with units; write depth_mm,force_mN above the rows"
+        raise InputError(f"{path}: {unknown or missing}")
     found, delimiter = _depth_and_force(lines, head), _delimiter_of(lines, head)
     columns, notes = _in_si_units(str(path), lines, head, delimiter, found)
     notes = [*_told_of_others(lines, head, found), *notes]
@@ -194,14 +196,44 @@ def _places(cells: list[str], below: list[str], quantity: str) -> list[_PlacedCo
     have a unit."""
     found, units = [], INDENTATION_UNITS[quantity]
     for j, cell in enumerate(cells):
-        words = [w for w in re.split(r"[\s_()\[\]#\"/,]+", cell) if w]
+        words = _words_of_heading(cell)
         unit = words[-1] if len(words) > 1 and words[-1] in units else None
         if unit is None and j < len(below):
             unit = next((w for w in [below[j].strip('[]() "')] if w in units), None)
-        rank = next((k for k, word in enumerate(_WORDS[quantity]) if cell.lower().lstrip('# "').startswith(word)), None)
-        if unit is not None and rank is not None and not _NOT & {w.lower() for w in words}:
+        rank = _place_among_words(cell, quantity)
+        if unit is not None and rank is not None:
             found.append((rank, j, _PlacedColumn(j, cell.strip('# "'), units[unit])))
     return [place for _, _, place in sorted(found)]
+
+
+def _words_of_heading(cell: str) -> list[str]:
+    return [w for w in re.split(r"[\s_()\[\]#\"/,]+", cell) if w]
+
+
+def _place_among_words(cell: str, quantity: str) -> int | None:
+    """Return the place in `_WORDS` of the word with which a heading begins, or None if the heading names another
+    quantity."""
+    if _NOT & {w.lower() for w in _words_of_heading(cell)}:
+        return None
+    return next((k for k, word in enumerate(_WORDS[quantity]) if cell.lower().lstrip('# "').startswith(word)), None)
+
+
+def _told_of_unknown_unit(line: str) -> str | None:
+    """Return a message on the first unknown unit in a line that names depth and force, or None if there is none. Such a
+    unit is in brackets or follows an underscore."""
+    for sign in "\t;,":
+        cells = split_cells(line, sign)
+        named = [(q, [cell for cell in cells if _place_among_words(cell, q) is not None]) for q in _WORDS]
+        if not all(headings for _, headings in named):
+            continue
+        for quantity, headings in named:
+            known = INDENTATION_UNITS[quantity]
+            stated = re.search(r"(?:[\[(]\s*|_)([^\s_\[\]()]+)\s*[\])]?\s*$", headings[0])
+            if stated is not None and stated[1] not in known:
+                return (
+                    f"unit {stated[1]!r} of {headings[0]!r} is not known; use {', '.join(filter(str.isascii, known))}"
+                )
+    return None
 
 
 def _told_of_others(lines: list[str], head: int, found: dict[str, _PlacedColumn]) -> list[str]:

@@ -164,8 +164,8 @@ def _header(lines: list[str]) -> tuple[int, str, dict[str, tuple[int, str]]] | N
 
 
 def _quantity_named(cell: str) -> tuple[str, str] | None:
-    """Return quantity and unit of a heading, for example "Phase velocity (m/s)" or "attenuation_Np/m". Return None if
-    the heading is not known."""
+    """Return quantity and unit of a heading, for example "Phase velocity (m/s)" or "attenuation_Np/m". An angular
+    frequency without a unit is in rad/s. Return None if the heading is not known."""
     parts = re.match(r'^"?([^\[(]*?)\s*(?:[\[(]\s*([^\])]*?)\s*[\])])?"?$', cell.strip())
     if parts is None:
         return None
@@ -173,7 +173,8 @@ def _quantity_named(cell: str) -> tuple[str, str] | None:
     for word, quantity in WORDS:
         if name.lower().startswith(word):
             rest = parts.group(1).strip()[len(word) :].strip("_ ")
-            return quantity, (parts.group(2) or rest).replace("s-1", "1/s")
+            unit = (parts.group(2) or rest).replace("s-1", "1/s")
+            return quantity, unit or ("rad/s" if word == "angular frequency" else "")
     return None
 
 
@@ -181,7 +182,6 @@ def _columns(path: str, lines: list[str], header: tuple) -> dict[str, np.ndarray
     k, delimiter, found = header
     factors = {}
     for quantity, (_, unit) in found.items():
-        unit = unit or ("rad/s" if "angular" in lines[k].lower() and quantity == "frequency" else "")
         known = WAVE_UNITS[quantity]
         if unit and unit not in known:
             raise InputError(f"{path}: unit {unit!r} of {quantity} is not known; use {', '.join(known)}")
