@@ -11,6 +11,7 @@ from fitting.fits.time_tests import INDEPENDENT
 from fitting.methods import time_response, uncertainty
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers import time_tests as reader
+from fitting.readers.base_line import base_line
 from fitting.readers.frequency_sweep import Sweep
 from fitting.readers.time_tests import TimeTest
 
@@ -214,6 +215,22 @@ def test_errors_contain_the_error_of_a_subtracted_offset(tmp_path):
     both = choose_together([test, test], "prony", 2)
     one, two = (uncertainty.equilibrium_error(f.uncertainty) for f in (fit, both))
     assert np.isclose(two, one / np.sqrt(2), rtol=0.05)
+
+
+@pytest.mark.parametrize("case", ["short rest", "settling"])
+def test_a_drift_that_may_not_continue_is_not_continued(case):
+    """A straight line through such rows would change the last response by 26 or 970 Pa."""
+    rng = np.random.default_rng(1)
+    if case == "short rest":  # 0.2 s of slow noise, then a hold of 1000 s
+        time, end = np.arange(-0.2, 0, 0.01), 1000.0
+        answer = 0.1 * np.cumsum(rng.standard_normal(20)) / 4
+    else:
+        time, end = np.arange(-10.0, 0, 0.5), 160.0
+        answer = 2 * np.exp(-(time + 10) / 5)
+    found = base_line(time, answer, 50.0, end)
+    assert found is None or (found.slope == 0 and abs(found.level - answer.mean()) < 1e-12)
+    if case == "settling":
+        assert found.moving and found.level_error > 0.5
 
 
 @pytest.mark.parametrize("rate", [0.01, pytest.param(-0.01, marks=pytest.mark.slow)])

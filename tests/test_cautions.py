@@ -172,6 +172,11 @@ def test_waves_without_a_mass_are_told():
     soft = lj.Region(elements=np.array([0, 1]), law={"mu": 1e-4 * float(heavy.law.shear_modulus())})
     (said,) = [s for s in cautions_of_waves(replace(slow, region=(soft,))) if "shear waves" in s]
     assert said.startswith(f"at 1 Hz shear waves are about {0.6 * wave:.2g} m long")
+    quadratic = lj.quadratic(BOX)
+    points = np.full((4, quadratic.number_of_elements), float(heavy.law.shear_modulus()))  # one at each point
+    push = replace(push, triangles=lj.boundary.boundary_triangles(quadratic)[:1])
+    varied = replace(slow, mesh=quadratic, law=replace(slow.law, mu=points), traction=(push,))
+    assert cautions_of_waves(varied) == []
 
 
 SCENE = """

@@ -18,7 +18,7 @@ from fitting.fits import simulated_rheometer, viscoelastic
 from fitting.fits.honesty import total_error
 from fitting.fits.honesty.edges import HALF_DECADE
 from fitting.fits.viscoelastic import Fit, Kind
-from fitting.methods import as_prony_modes, host, uncertainty
+from fitting.methods import as_prony_modes, generalised_maxwell, host, uncertainty
 from fitting.methods.estimate import Estimate, estimated, wider
 from fitting.methods.generalised_maxwell import Maxwell, weighed
 from fitting.readers import raw_torque
@@ -120,21 +120,24 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
     if not known or fit.kind.values is not None or not isinstance(fit.solution.u, np.ndarray):
         return fit, sweep
     weighed = _with_noise_as_measured(sweep)
-    tried = [_errors_of_instrument(_fitted_again(fit, weighed), weighed), *_with_other_modes(fit, weighed)]
-    best = _with_lowest_criterion(tried, weighed)
-    errors = InstrumentErrors(best.values, best.covariance, *_of_part(best.fit, weighed), best.found)
-    details = fit.details | {"instrument": instrument_numbers(errors, known)}
-    if not errors.steady.all():
+    tried = [_errors_of_instrument(_fitted_again(fit, weighed), weighed), *_with_more_modes(fit, weighed)]
+    determined = [own for own in tried if _all_modes_determined(own, weighed)] or tried[:1]
+    ways = [(own, _in_both_bands(own, weighed)) for own in sorted(determined, key=lambda own: own.criterion)]
+    best, errors = next(((own, e) for own, e in ways if e.steady.all()), (tried[0], None))
+    if errors is None:
+        errors = _in_both_bands(best, weighed)
+        details = fit.details | {"instrument": instrument_numbers(errors, known)}
         return fit._replace(details=details, warnings=(*fit.warnings, *_not_corrected(errors, known))), sweep
     corrected = _shifted(weighed, known, best.values)
     corrected = corrected._replace(notes=(*sweep.notes, *_corrections(known, best)))
+    details = fit.details | {"instrument": instrument_numbers(errors, known)}
     refitted = best.fit._replace(details=details)
     if viscoelastic.TRIED in details:
-        refitted = viscoelastic.beside_other_numbers(refitted, [own.fit for own in tried], corrected, {})
+        refitted = _beside_more_modes(fit, refitted, tried, weighed)
     return refitted._replace(uncertainty=_with_directions(refitted, corrected, known, best.covariance)), corrected
 
 
-def _with_other_modes(fit: Fit, sweep: Sweep) -> list[Corrected]:
+def _with_more_modes(fit: Fit, sweep: Sweep) -> list[Corrected]:
     """Return the instrument errors with more modes. The list is empty if the user gave the number of modes.
 
     If the inertia is wrong, a fit with enough modes may not converge, so too few modes are chosen at first.
@@ -142,35 +145,42 @@ def _with_other_modes(fit: Fit, sweep: Sweep) -> list[Corrected]:
     if viscoelastic.TRIED not in fit.details:
         return []
     most = min(fit.modes + 2, viscoelastic.most_modes(sweep))
-    return [_from_several_starts(modes, sweep) for modes in range(fit.modes + 1, most + 1)]
+    found = [_from_several_starts(fit, modes, sweep) for modes in range(fit.modes + 1, most + 1)]
+    return [own for own in found if own is not None]
 
 
-def _from_several_starts(modes: int, sweep: Sweep) -> Corrected:
-    """Return the instrument errors with this number of modes. If the search from 0 finds no fit whose modes the data
-    determine, it is repeated from errors of one standard deviation of the prior. A wrong inertia can make G' fall with
-    the frequency; a mode with a time near 0 then takes the place of the error.
+def _from_several_starts(fit: Fit, modes: int, sweep: Sweep) -> Corrected | None:
+    """Return the instrument errors with this number of modes of the kind of `fit`, or None if every fit failed.
+
+    If the search from 0 finds no fit whose modes the data determine, it is repeated from errors of one standard
+    deviation of the prior. A wrong inertia can make G' fall with the frequency; a mode with a time near 0 then takes
+    the place of the error.
     """
     known, found = nuisances_of(sweep), []
     for start in (0.0, 1.0, -1.0):
         values = np.eye(len(known))[0] * start
         moved = _shifted(sweep, known, values)
-        if np.all(moved.storage > 0) and np.all(moved.loss > 0):
-            found.append(_errors_of_instrument(viscoelastic.closed_form(moved, modes), sweep, values))
-            if _of_determined_modes(found[-1], sweep):
-                return found[-1]
-    return found[0]
+        if not (np.all(moved.storage > 0) and np.all(moved.loss > 0)):
+            continue
+        try:
+            begin = generalised_maxwell.starts(moved, modes, generalised_maxwell.spectrum(moved))
+            own = viscoelastic.modes_from(moved, begin, fit.kind)
+            found.append(_errors_of_instrument(own, sweep, values))
+        except (ArithmeticError, RuntimeError, ValueError):  # no fit at this start
+            continue
+        if _all_modes_determined(found[-1], sweep):
+            return found[-1]
+    return found[0] if found else None
 
 
-def _of_determined_modes(own: Corrected, sweep: Sweep) -> bool:
+def _all_modes_determined(own: Corrected, sweep: Sweep) -> bool:
+    """Return whether the instrument errors were found, and the data determine all modes."""
     return own.found and viscoelastic.identifiable(own.fit, sweep)
 
 
-def _with_lowest_criterion(tried: list[Corrected], sweep: Sweep) -> Corrected:
-    """Return the result with the lowest criterion, which contains the prior of the instrument errors. If no result has
-    only modes that the data determine, return the first result."""
-    return min(
-        (own for own in tried if _of_determined_modes(own, sweep)), key=lambda own: own.criterion, default=tried[0]
-    )
+def _in_both_bands(own: Corrected, sweep: Sweep) -> InstrumentErrors:
+    """Return the instrument errors, also without the last half decade of the sweep."""
+    return InstrumentErrors(own.values, own.covariance, *_of_part(own.fit, sweep), own.found)
 
 
 def _of_part(fit: Fit, sweep: Sweep) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -182,6 +192,25 @@ def _of_part(fit: Fit, sweep: Sweep) -> tuple[np.ndarray | None, np.ndarray | No
     shorter = some(sweep, kept)
     part = _errors_of_instrument(viscoelastic.closed_form(shorter, fit.modes), shorter)
     return (part.values, np.sqrt(np.diag(part.covariance))) if part.found else (None, None)
+
+
+def _beside_more_modes(fit: Fit, chosen: Fit, tried: list[Corrected], sweep: Sweep) -> Fit:
+    """Return the chosen fit with the table of tried numbers of modes, and with warnings about them.
+
+    The rows of fewer modes are those of the uncorrected moduli. Each other row belongs to the moduli that are corrected
+    by its own instrument errors.
+    """
+    known = nuisances_of(sweep)
+    rows = [row for row in fit.details[viscoelastic.TRIED] if row["modes"] < fit.modes]
+    rows += [
+        viscoelastic.row_of_modes(own.fit, _shifted(sweep, known, own.values))
+        | {"information_criterion": own.criterion}
+        for own in tried
+    ]
+    mine = next(row for row in rows if row["modes"] == chosen.modes)
+    warnings = [w for w in fit.warnings if viscoelastic.NOT_FITTED in w]
+    warnings += viscoelastic.closer_number(rows, mine, [own.fit for own in tried])
+    return chosen._replace(warnings=(*chosen.warnings, *warnings), details=chosen.details | {viscoelastic.TRIED: rows})
 
 
 def _corrections(known: list[Nuisance], best: Corrected) -> list[str]:

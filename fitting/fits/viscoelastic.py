@@ -284,6 +284,8 @@ def information_criterion(fit: Fit) -> float:
 
 #: Key in `Fit.details` of the table of tried numbers of modes.
 TRIED = "modes_tried"
+#: End of the warning about a number of modes whose fit failed.
+NOT_FITTED = "so this number of modes could not be chosen"
 #: A fit counts as exact if all its relative errors are below this value, because no data have so many digits.
 EXACT = 1e-7
 
@@ -327,8 +329,12 @@ def choose_modes(
             break
     if chosen is None:
         raise InputError(f"{sweep.source or 'sweep'}: every fit failed (with 1 mode: {broken[1]}); check the data")
-    chosen = beside_other_numbers(chosen, tried, sweep, broken)
+    rows = [row_of_modes(f, sweep) for f in tried]
+    warnings = closer_number(rows, rows[[f.modes for f in tried].index(chosen.modes)], tried)
+    for modes, reason in broken.items():
+        warnings.append(f"{modes} mode{'s' if modes > 1 else ''} could not be fitted ({reason}), {NOT_FITTED}")
     compiling, running = sum(f.compile_time for f in tried), sum(f.run_time for f in tried)
+    chosen = chosen._replace(warnings=(*chosen.warnings, *warnings), details=chosen.details | {TRIED: rows})
     return chosen._replace(compile_time=compiling, run_time=running), tried
 
 
@@ -337,42 +343,24 @@ def most_modes(sweep: Sweep) -> int:
     return min(uncertainty.supported_modes(sweep), generalised_maxwell.largest_number_of_modes(sweep))
 
 
-def beside_other_numbers(chosen: Fit, tried: list[Fit], sweep: Sweep, broken: dict[int, str]) -> Fit:
-    """Return the chosen fit with a table of all tried numbers of modes in its details, and with warnings about a closer
-    fit that was not chosen and about fits that failed.
-
-    Args:
-        chosen, tried: the fits to the sweep.
-        sweep: the data.
-        broken: number of modes -> error message of its fit.
-    """
-    table = [
-        {
-            "modes": f.modes,
-            "information_criterion": float(information_criterion(f)),
-            "identifiable": identifiable(f, sweep),
-            "mean_relative_error": float(np.mean(f.relative_errors(sweep))),
-        }
-        for f in tried
-    ]
-    warnings = (*chosen.warnings, *_other_numbers(sweep, chosen, tried, broken))
-    return chosen._replace(warnings=warnings, details=chosen.details | {TRIED: table})
+def row_of_modes(fit: Fit, sweep: Sweep) -> dict[str, float]:
+    """Return a row of the table of tried numbers of modes in fit.json."""
+    return {
+        "modes": fit.modes,
+        "information_criterion": float(information_criterion(fit)),
+        "identifiable": identifiable(fit, sweep),
+        "mean_relative_error": float(np.mean(fit.relative_errors(sweep))),
+    }
 
 
-def _other_numbers(sweep: Sweep, chosen: Fit, tried: list[Fit], broken: dict[int, str]) -> list[str]:
-    """Return warnings about fits with other numbers of modes: a closer fit that was not chosen, and fits that
-    failed."""
-    out = []
-    closer = min(tried, key=information_criterion)
-    if information_criterion(closer) < information_criterion(chosen) - 10:
-        errors = [float(np.mean(f.relative_errors(sweep))) for f in (closer, chosen)]
-        out.append(closer_but_not_chosen(closer.modes, errors, closer.converged))
-    for modes, reason in broken.items():
-        out.append(
-            f"{modes} mode{'s' if modes > 1 else ''} could not be fitted ({reason}), so this number of modes could "
-            "not be chosen"
-        )
-    return out
+def closer_number(rows: list[dict[str, float]], chosen: dict[str, float], tried: list[Fit]) -> list[str]:
+    """Return a warning if another number of modes has a much lower criterion than the chosen one."""
+    closer = min(rows, key=lambda row: row["information_criterion"])
+    if closer["information_criterion"] >= chosen["information_criterion"] - 10:
+        return []
+    converged = next((f.converged for f in tried if f.modes == closer["modes"]), True)
+    errors = [row["mean_relative_error"] for row in (closer, chosen)]
+    return [closer_but_not_chosen(int(closer["modes"]), errors, converged)]
 
 
 def closer_but_not_chosen(modes: int, errors: list[float], converged: bool) -> str:

@@ -6,9 +6,12 @@ import numpy as np
 
 #: Minimum number of rows at rest that can show an offset or a drift. A base line is ignored if it changes no response
 #: by more than OFFSET times the largest response.
-RESTING, DRIFTING, OFFSET = 3, 8, 0.003
+RESTING, DRIFTING, OFFSET = 3, 10, 0.003
 #: A drift is clear above this number of its standard errors. The limit for an offset is 3.
-_CLEAR = 4
+_CLEAR_DRIFT = 4
+#: A drift is continued under load only if the rows at rest last at least _LONG times as long as the load, and if it
+#: changes no response by more than _LARGE times the largest one.
+_LONG, _LARGE = 0.2, 0.3
 #: The error of a drift is at least this fraction of it, because nothing shows how it continues under load.
 _CONTINUED = 0.5
 
@@ -20,6 +23,7 @@ class BaseLine(NamedTuple):
     level_error: float
     slope: float = 0.0  # per second
     slope_error: float = 0.0
+    moving: bool = False  # whether the responses change during the rest, but not in a way that can be continued
 
 
 def base_line(time: np.ndarray, answer: np.ndarray, size: float, end: float) -> BaseLine | None:
@@ -33,13 +37,34 @@ def base_line(time: np.ndarray, answer: np.ndarray, size: float, end: float) -> 
     """
     if len(time) < RESTING:
         return None
-    if len(time) >= DRIFTING:
-        A = np.column_stack([np.ones(len(time)), time])
-        level, slope = np.linalg.lstsq(A, answer, rcond=None)[0]
-        variance = float(np.sum((answer - A @ (level, slope)) ** 2)) / (len(time) - 2)
-        level_error, slope_error = np.sqrt(variance * np.diag(np.linalg.inv(A.T @ A)))
-        if abs(slope) > _CLEAR * slope_error and abs(slope) * end > OFFSET * size:
-            error = max(float(slope_error), _CONTINUED * abs(float(slope)))
-            return BaseLine(float(level), float(level_error), float(slope), error)
     mean, error = float(np.mean(answer)), float(np.std(answer, ddof=1)) / np.sqrt(len(answer))
-    return BaseLine(mean, error) if abs(mean) > max(3 * error, OFFSET * size) else None
+    flat = BaseLine(mean, error) if abs(mean) > max(3 * error, OFFSET * size) else None
+    if len(time) < DRIFTING or not np.ptp(time) > 0:
+        return flat
+    level, slope, level_error, slope_error = _straight_line(time, answer)
+    rest = float(np.ptp(time))
+    if abs(slope) <= _CLEAR_DRIFT * slope_error or abs(slope) * max(rest, end) <= OFFSET * size:
+        return flat
+    half = len(time) // 2
+    (_, first, _, e1), (_, second, _, e2) = (
+        _straight_line(time[:half], answer[:half]),
+        _straight_line(time[half:], answer[half:]),
+    )
+    steady = abs(first - second) < 3 * np.hypot(e1, e2)
+    if steady and rest > _LONG * end and abs(slope) * end < _LARGE * size:
+        return BaseLine(level, level_error, slope, max(slope_error, _CONTINUED * abs(slope)))
+    error = max(error, 0.5 * abs(slope) * rest)
+    return BaseLine(mean, error, moving=True) if error > OFFSET * size else flat
+
+
+def _straight_line(time: np.ndarray, answer: np.ndarray) -> tuple[float, float, float, float]:
+    """Return value at time 0 and slope of the straight line through responses (n,), and their two standard errors. The
+    errors contain the correlation between neighbouring responses."""
+    A = np.column_stack([np.ones(len(time)), time])
+    found = np.linalg.lstsq(A, answer, rcond=None)[0]
+    off = answer - A @ found
+    square = float(off @ off)
+    alike = min(max(float(off[1:] @ off[:-1]) / square, 0.0), 0.95) if square > 0 else 0.0
+    variance = square / (len(time) - 2) * (1 + alike) / (1 - alike)
+    errors = np.sqrt(variance * np.diag(np.linalg.inv(A.T @ A)))
+    return float(found[0]), float(found[1]), float(errors[0]), float(errors[1])

@@ -155,9 +155,9 @@ def corner_orders(mesh: TetMesh) -> np.ndarray:
         return np.tile(_ORDERS[0][:, None], E)
     a, b, c, d = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)].transpose(1, 0, 2)
     diagonals = np.linalg.norm([a + c - b - d, a + d - b - c, a + b - c - d], axis=2)
-    # Lengths are rounded, so that the choice between diagonals of equal length is the same on all machines.
-    relative = (diagonals / diagonals.max(axis=0)).astype(np.float32)
-    return _ORDERS[relative.argmin(axis=0)].T
+    # Of diagonals with equal length, apart from the roundoff of float32, the first is taken on all machines.
+    shortest = diagonals <= (1 + 1e-5) * diagonals.min(axis=0)
+    return _ORDERS[shortest.argmax(axis=0)].T
 
 
 def _corners_of_parts(a: Array, b: Array, c: Array, d: Array, *middles: Array) -> np.ndarray:

@@ -61,7 +61,8 @@ def _of_short_waves(scene: Scene, hertz: float) -> list[str]:
         moduli = np.asarray(by_element(scene).law.shear_modulus(), float)
     except InputError:  # a law may have no moduli
         return []
-    moduli = np.broadcast_to(np.ravel(moduli), scene.mesh.number_of_elements)
+    # The lowest modulus of each element, if it has several points.
+    moduli = np.broadcast_to(np.atleast_2d(moduli).min(axis=0), scene.mesh.number_of_elements)
     corners = np.asarray(scene.mesh.points)[np.asarray(scene.mesh.tetrahedra)]
     edges = np.linalg.norm(corners[:, [0, 0, 0, 1, 1, 2]] - corners[:, [1, 2, 3, 2, 3, 3]], axis=2)
     softest = moduli <= moduli.min() * (1 + 1e-9)
