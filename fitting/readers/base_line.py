@@ -7,8 +7,8 @@ import numpy as np
 #: Minimum number of rows at rest that can show an offset or a drift. A base line is ignored if it changes no response
 #: by more than OFFSET times the largest response.
 RESTING, DRIFTING, OFFSET = 3, 10, 0.003
-#: A drift is clear above this number of its standard errors. The limit for an offset is 3.
-_CLEAR_DRIFT = 4
+#: A drift is possible, or clear, above these numbers of its standard errors. The limit for an offset is 3.
+_POSSIBLE, _CLEAR = 2.5, 4.0
 #: A drift is continued under load only if the rows at rest last at least _LONG times as long as the load, and if it
 #: changes no response by more than _LARGE times the largest one.
 _LONG, _LARGE = 0.2, 0.3
@@ -23,7 +23,7 @@ class BaseLine(NamedTuple):
     level_error: float
     slope: float = 0.0  # per second
     slope_error: float = 0.0
-    moving: bool = False  # whether the responses change during the rest, but not in a way that can be continued
+    left: float = 0.0  # slope of the rows at rest that is not subtracted, because it may not continue
 
 
 def base_line(time: np.ndarray, answer: np.ndarray, size: float, end: float) -> BaseLine | None:
@@ -43,7 +43,7 @@ def base_line(time: np.ndarray, answer: np.ndarray, size: float, end: float) -> 
         return flat
     level, slope, level_error, slope_error = _straight_line(time, answer)
     rest = float(np.ptp(time))
-    if abs(slope) <= _CLEAR_DRIFT * slope_error or abs(slope) * max(rest, end) <= OFFSET * size:
+    if abs(slope) <= _POSSIBLE * slope_error or abs(slope) * max(rest, end) <= OFFSET * size:
         return flat
     half = len(time) // 2
     (_, first, _, e1), (_, second, _, e2) = (
@@ -51,10 +51,13 @@ def base_line(time: np.ndarray, answer: np.ndarray, size: float, end: float) -> 
         _straight_line(time[half:], answer[half:]),
     )
     steady = abs(first - second) < 3 * np.hypot(e1, e2)
-    if steady and rest > _LONG * end and abs(slope) * end < _LARGE * size:
+    small = abs(slope) * end < _LARGE * size
+    if steady and small and rest > _LONG * end and abs(slope) > _CLEAR * slope_error:
         return BaseLine(level, level_error, slope, max(slope_error, _CONTINUED * abs(slope)))
     error = max(error, 0.5 * abs(slope) * rest)
-    return BaseLine(mean, error, moving=True) if error > OFFSET * size else flat
+    if steady and small:  # the whole drift is an error
+        return BaseLine(mean, error, slope_error=abs(slope), left=slope)
+    return BaseLine(mean, error, left=slope) if error > OFFSET * size else flat
 
 
 def _straight_line(time: np.ndarray, answer: np.ndarray) -> tuple[float, float, float, float]:

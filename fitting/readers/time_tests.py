@@ -478,11 +478,12 @@ def _without_base_line(test: TimeTest) -> tuple[TimeTest, list[str]]:
             f"{100 * abs(line.level) / size:.2g} % of the largest {what} (absolute value): this sensor offset is "
             "subtracted"
         )
-        if line.moving:
+        if line.left:
             told += (
-                f". But the {what} changes during these rows: the sensor drifts, or the sample has not settled. The "
-                f"error of the offset is taken as {line.level_error:.2g}{unit}: begin the load after the sensor is "
-                "steady, or record a longer rest"
+                f". But the {what} changes during these rows, by {line.left:.2g}{unit} per second: the sensor may "
+                "drift, or the sample has not settled. If this change continues under load, the last response is wrong "
+                f"by {abs(line.left) * time[-1]:.2g}{unit}"
+                f"{', and the errors allow for this' if line.slope_error else ''}: record a longer rest"
             )
     answer = test.answer - line.level - line.slope * time
     return test._replace(answer=answer, offset_error=line.level_error, drift_error=line.slope_error), [told]
