@@ -155,8 +155,8 @@ def test_inlets_that_would_do_nothing_are_refused():
     scene_from(content([low, top, side]))
     scene_from(content([low, side, top], drained=[{"z_max": 0.0}]))
     for inlets, drained, words in (
-        ([low, dict(low, pressure=-3.0)], [], "porosity.inlet.1 gives a pressure at nodes that are all"),
-        ([low], [LOW], "porosity.inlet.0 gives a pressure at nodes that are all"),
+        ([low, dict(low, pressure=-3.0)], [], "porosity.inlet.0 has no effect, because porosity.inlet.1"),
+        ([low], [LOW], "porosity.drained has no effect, because porosity.inlet.0"),
         ([low, top], [TOP], "porosity.inlet.1 is a flux through a surface"),
     ):
         with pytest.raises(InputError, match=words):

@@ -75,6 +75,17 @@ def test_a_viscous_run_that_is_too_short_to_end_in_the_given_shape_is_told():
     assert said(3.0, dt=1.0, steps=3) == said(0.15, dt=0.05, kind="dynamic") == []
 
 
+def test_friction_in_several_steps_is_told():
+    """After five steps, a body on a rough plane stayed 11 % of its motion away from the given shape."""
+    plane = {"shape": "plane", "position": [0, 0, 1e-4], "axis": [0, 0, 1], "where": {"z_max": 0.0}, "friction": 0.3}
+    scene = scene_from(content(obstacle=[plane], solve={"steps": 5}))
+    (sentence,) = cautions._of_friction_at_start(scene)
+    assert "the friction of obstacle.0 depends on the steps" in sentence
+    smooth = replace(scene, physics=(), solve=scene.solve)
+    once = replace(scene, solve=replace(scene.solve, steps=1))
+    assert cautions._of_friction_at_start(smooth) == cautions._of_friction_at_start(once) == []
+
+
 @pytest.mark.slow
 def test_the_command_tells_it_too(tmp_path, capsys):
     """The command runs the unloaded scene, whose points are the reference shape. There the warning was missing."""

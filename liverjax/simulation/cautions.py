@@ -58,6 +58,7 @@ def cautions_of_run(scene: Scene, result: Result) -> list[str]:
         *of_locking(scene),
         *cautions_of_histories(scene, np.asarray(result.times)),
         *_of_stress_at_start(scene, result),
+        *_of_friction_at_start(scene),
         *_of_growing_motion(scene, result),
         *_of_contacts(scene, result),
         *_of_pressures(scene, result),
@@ -170,6 +171,18 @@ def of_locking(scene: Scene) -> list[str]:
     return [
         f"the bulk modulus is {ratio:.3g} times the shear modulus, so these quadratic elements are too stiff: "
         "write volumetric = 'mixed' in [solve]"
+    ]
+
+
+def _of_friction_at_start(scene: Scene) -> list[str]:
+    """Warn if a static run that begins at a given loaded shape has friction and applies its loads in several steps."""
+    rough = [name for name, own in named_physics(scene) if isinstance(own, RoughObstacle)]
+    solve = scene.solve
+    if scene.points_are != "loaded" or not rough or solve.kind != "static" or solve.dt is not None or solve.steps == 1:
+        return []
+    return [
+        "the unloaded shape was computed with all loads in one step, but the friction of "
+        f"{' and '.join(rough)} depends on the steps. The body does not end in the given shape after {solve.steps} steps: write steps = 1"
     ]
 
 

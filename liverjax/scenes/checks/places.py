@@ -76,20 +76,26 @@ def _has_vertices(mesh: TetMesh, nodes: object, name: str) -> None:
 
 
 def _inlets_that_act(sponge: Porosity) -> None:
-    """Raise InputError if an inlet has no effect, because the pressure is already given at all of its nodes.
+    """Raise InputError if an inlet has no effect, because other pressures are given at all of its nodes.
 
-    Inlets may have some nodes in common.
+    Inlets may have some nodes in common with other inlets or with the drained nodes: the later inlet counts there.
     """
-    given = [] if sponge.drained is None else [set(np.asarray(sponge.drained).tolist())]
-    pressures = [(k, inlet) for k, inlet in enumerate(sponge.inlet) if inlet.nodes is not None]
-    for k, inlet in pressures:
-        own = set(np.asarray(inlet.nodes).tolist())
-        if any(own <= place for place in given):
+    pressures = {k: set(np.asarray(own.nodes).tolist()) for k, own in enumerate(sponge.inlet) if own.nodes is not None}
+    for k, own in pressures.items():
+        over = next((later for later, nodes in pressures.items() if later > k and own <= nodes), None)
+        if over is not None:
             raise InputError(
-                f"porosity.inlet.{k} gives a pressure at nodes that are all drained or already have a given pressure: "
-                "select different nodes"
+                f"porosity.inlet.{k} has no effect, because porosity.inlet.{over} gives the pressure at all of its "
+                "nodes: give the larger inlet first, or select different nodes"
             )
-        given.append(own)
+    drained = set() if sponge.drained is None else set(np.asarray(sponge.drained).tolist())
+    over = next((k for k, nodes in pressures.items() if drained and drained <= nodes), None)
+    if over is not None:
+        raise InputError(
+            f"porosity.drained has no effect, because porosity.inlet.{over} gives the pressure at all of its nodes: "
+            "remove one of them, or select different nodes"
+        )
+    given = [*pressures.values(), drained]
     for k, inlet in enumerate(sponge.inlet):
         corners = set() if inlet.triangles is None else set(np.ravel(inlet.triangles).tolist())
         if inlet.nodes is None and any(corners <= place for place in given):
