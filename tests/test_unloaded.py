@@ -3,7 +3,6 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +15,7 @@ from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
 from liverjax.scenes.scene_file import scene_from
-from liverjax.simulation import cautions
-from liverjax.simulation.unloaded import unload
+from liverjax.simulation.unloaded import cautions_of_loaded, unload
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -66,9 +64,7 @@ def test_a_viscous_run_that_is_too_short_to_end_in_the_given_shape_is_told():
 
     def said(lasts, **solve):
         at = replace(scene, solve=replace(scene.solve, **solve))
-        zero = jnp.zeros((1, *scene.mesh.points.shape))
-        none = jnp.zeros(1)
-        return cautions._of_stress_at_start(at, SimpleNamespace(times=jnp.array([lasts]), positions=zero, status=none))
+        return cautions_of_loaded(at, jnp.array([lasts]))
 
     (sentence,) = said(0.15, dt=0.05, steps=3)
     assert "lasts 0.15 s, but a relaxation time is 0.3 s" in sentence
@@ -79,11 +75,11 @@ def test_friction_in_several_steps_is_told():
     """After five steps, a body on a rough plane stayed 11 % of its motion away from the given shape."""
     plane = {"shape": "plane", "position": [0, 0, 1e-4], "axis": [0, 0, 1], "where": {"z_max": 0.0}, "friction": 0.3}
     scene = scene_from(content(obstacle=[plane], solve={"steps": 5}))
-    (sentence,) = cautions._of_friction_at_start(scene)
+    (sentence,) = cautions_of_loaded(scene, jnp.zeros(5))
     assert "the friction of obstacle.0 depends on the steps" in sentence
     smooth = replace(scene, physics=(), solve=scene.solve)
     once = replace(scene, solve=replace(scene.solve, steps=1))
-    assert cautions._of_friction_at_start(smooth) == cautions._of_friction_at_start(once) == []
+    assert cautions_of_loaded(smooth, jnp.zeros(5)) == cautions_of_loaded(once, jnp.zeros(1)) == []
 
 
 @pytest.mark.slow

@@ -32,6 +32,7 @@ from liverjax.scenes.scene import Scene, histories, named_physics
 from liverjax.simulation.automatic import qualities
 from liverjax.simulation.obstacle_forces import obstacle_forces
 from liverjax.simulation.run import Result
+from liverjax.simulation.unloaded import cautions_of_loaded
 
 #: No organ is longer than this [m]. If millimetres are read as centimetres, a liver seems to be 2 m long.
 LONGEST = 1.0
@@ -57,8 +58,7 @@ def cautions_of_run(scene: Scene, result: Result) -> list[str]:
         *cautions_of_mesh(scene.mesh),
         *of_locking(scene),
         *cautions_of_histories(scene, np.asarray(result.times)),
-        *_of_stress_at_start(scene, result),
-        *_of_friction_at_start(scene),
+        *cautions_of_loaded(scene, result.times),
         *_of_growing_motion(scene, result),
         *_of_contacts(scene, result),
         *_of_pressures(scene, result),
@@ -171,38 +171,6 @@ def of_locking(scene: Scene) -> list[str]:
     return [
         f"the bulk modulus is {ratio:.3g} times the shear modulus, so these quadratic elements are too stiff: "
         "write volumetric = 'mixed' in [solve]"
-    ]
-
-
-def _of_friction_at_start(scene: Scene) -> list[str]:
-    """Warn if a static run that begins at a given loaded shape has friction and applies its loads in several steps."""
-    rough = [name for name, own in named_physics(scene) if isinstance(own, RoughObstacle)]
-    solve = scene.solve
-    if scene.points_are != "loaded" or not rough or solve.kind != "static" or solve.dt is not None or solve.steps == 1:
-        return []
-    return [
-        "the unloaded shape was computed with all loads in one step, but the friction of "
-        f"{' and '.join(rough)} depends on the steps. The body does not end in the given shape after {solve.steps} steps: write steps = 1"
-    ]
-
-
-#: After this number of relaxation times, the stress of an initially unrelaxed body is relaxed to within 1 %.
-_RESTS = 5.0
-
-
-def _of_stress_at_start(scene: Scene, result: Result) -> list[str]:
-    """Warn if a static run that begins at a given loaded shape ends before the viscous stress has relaxed."""
-    if scene.points_are != "loaded" or scene.viscosity is None or scene.solve.kind != "static":
-        return []
-    own, lasts = by_element(scene).viscosity, float(result.times[-1])
-    assert own is not None
-    ratios, times = np.broadcast_arrays(np.asarray(own.ratios, float), np.asarray(own.relaxation_times, float))
-    slowest = float(np.max(times[ratios > 0], initial=0.0))
-    if scene.solve.dt is None or lasts > _RESTS * slowest:
-        return []
-    return [
-        f"the run begins with unrelaxed stress and lasts {lasts:.3g} s, but a relaxation time is {slowest:.3g} s, so "
-        "the body does not end in the given shape: remove viscosity, or simulate a longer time"
     ]
 
 

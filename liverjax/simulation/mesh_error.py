@@ -167,7 +167,7 @@ class Richer:
     )
 
     def padded(self, x: jax.Array) -> jax.Array:
-        """Convert positions x (V, 3) of the run to the coefficients of the same field in the richer space."""
+        """Convert positions x (V, 3) of the run to coefficients in the richer space. They describe the same field."""
         rich = self.scene.mesh
         if self.within is not None:
             return self.within.field(x)

@@ -284,7 +284,7 @@ def _groups_in_use(e: Equations, groups: Any) -> Any:
 
 @jax.jit
 def _coarse(e: Equations, A: BlockMatrix) -> Coarse:
-    """Return the coarse space of the vertices for the preconditioner."""
+    """Return the coarse space of the preconditioner, made from the tangent A of the vertices."""
     used = False if e.scene.solve.linear_solver == "direct" else worthwhile(A, _vertex_shift(e))
     return coarse(e.mesh, A, _coarse_mask(_of_vertices(e)), used)
 

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from liverjax import laws
 from liverjax.core import status
@@ -21,9 +22,11 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import Content, replace
 from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.tetrahedra import with_points
+from liverjax.physics.contact.friction import RoughObstacle
 from liverjax.physics.prescribed import Fixed
 from liverjax.physics.viscosity import lasting
-from liverjax.scenes.scene import Scene
+from liverjax.scenes.by_element import by_element
+from liverjax.scenes.scene import Scene, named_physics
 from liverjax.scenes.springpots import series_at_rest
 from liverjax.simulation import tangent
 from liverjax.simulation.equations import Equations, Sizes, equations, force_sizes, initial_state, residual, unknowns
@@ -32,6 +35,8 @@ from liverjax.solvers.newton import NewtonOptions, newton_root
 
 #: A Newton step that does not reduce the residual is halved. Only the last linear solve needs high accuracy.
 _OPTIONS = NewtonOptions(max_iterations=50, linear_tolerance=1e-2, max_halvings=12, symmetric=False)
+#: After this number of relaxation times, the stress of an initially unrelaxed body is relaxed to within 1 %.
+_RESTS = 5.0
 
 
 class Unloaded(NamedTuple):
@@ -96,7 +101,7 @@ def _found_shape(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array]:
     K = tangent.tangent(first, pressure, given, one)
 
     def held(z: jax.Array) -> jax.Array:
-        e, q = _with_displacements_in(scene, given, z, sizes)
+        e, q = _with_displacements(scene, given, z, sizes)
         # Unknowns that are not free must be 0. Equations for this are added, so that the matrix has no empty rows.
         return residual(e, q, one)[0] + (z - _free_part(first, z))
 
@@ -121,7 +126,7 @@ def _displacements_in(e: Equations, z: jax.Array) -> jax.Array:
     return jnp.stack(e.free.columns(columns(z[: 3 * e.mesh.number_of_nodes])), axis=-1)
 
 
-def _with_displacements_in(scene: Scene, given: jax.Array, z: jax.Array, sizes: Sizes) -> tuple[Equations, jax.Array]:
+def _with_displacements(scene: Scene, given: jax.Array, z: jax.Array, sizes: Sizes) -> tuple[Equations, jax.Array]:
     """Return the equations of the body with the reference shape that follows from the unknowns z, and the unknowns of
     the loaded body."""
     still = equations(scene, initial_state(scene), jnp.ones((), given.dtype), sizes)
@@ -130,3 +135,43 @@ def _with_displacements_in(scene: Scene, given: jax.Array, z: jax.Array, sizes: 
     e = equations(one, initial_state(one), jnp.ones((), given.dtype), sizes)
     x = mesh.points + _displacements_in(e, z)
     return e, jnp.concatenate([flat(e.free.vectors(x)), z[3 * mesh.number_of_nodes :]])
+
+
+def cautions_of_loaded(scene: Scene, times: jax.Array) -> list[str]:
+    """Return warnings if a static run of a body with a given loaded shape does not end in this shape.
+
+    Args:
+        scene: the scene with the given shape.
+        times: times [s] of the steps of its run.
+    """
+    if scene.points_are != "loaded" or scene.solve.kind != "static":
+        return []
+    return [*_of_unrelaxed_stress(scene, times), *_of_friction(scene)]
+
+
+def _of_unrelaxed_stress(scene: Scene, reached: jax.Array) -> list[str]:
+    """Warn if the run ends before the viscous stress has relaxed."""
+    if scene.viscosity is None:
+        return []
+    own, lasts = by_element(scene).viscosity, float(reached[-1])
+    assert own is not None
+    ratios, times = np.broadcast_arrays(np.asarray(own.ratios, float), np.asarray(own.relaxation_times, float))
+    slowest = float(np.max(times[ratios > 0], initial=0.0))
+    if scene.solve.dt is None or lasts > _RESTS * slowest:
+        return []
+    return [
+        f"the run begins with unrelaxed stress and lasts {lasts:.3g} s, but a relaxation time is {slowest:.3g} s, so "
+        "the body does not end in the given shape: remove viscosity, or simulate a longer time"
+    ]
+
+
+def _of_friction(scene: Scene) -> list[str]:
+    """Warn if obstacles have friction and the loads are applied in several steps."""
+    rough = [name for name, own in named_physics(scene) if isinstance(own, RoughObstacle)]
+    solve = scene.solve
+    if not rough or solve.dt is not None or solve.steps == 1:
+        return []
+    return [
+        f"the unloaded shape was computed with all loads in one step, but the friction of {' and '.join(rough)} "
+        f"depends on the steps. The body does not end in the given shape after {solve.steps} steps: write steps = 1"
+    ]
