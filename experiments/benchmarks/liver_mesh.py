@@ -6,7 +6,7 @@ in eight steps, and in one. Both must end in the same equilibrium if they follow
 Under a quarter of that load, 0.5 m/s^2, its quadratic meshes are refined only at the edges of its clamps, where the
 strain is singular. Each refinement changes the result by two to three fifths of the change before.
 
-``python -m experiments liver_mesh`` (15 minutes) writes results/liver_mesh.json;
+``python -m experiments liver_mesh`` (6 minutes) writes results/liver_mesh.json;
 ``python -m experiments.benchmarks.liver_mesh clamps`` runs the second part again.
 """
 

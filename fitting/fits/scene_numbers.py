@@ -68,8 +68,8 @@ def misfit(problem: Problem, values: Mapping[str, object], store: str | int = "a
 
 
 def with_solvers(problem: Problem, values: Mapping[str, object]) -> Problem:
-    """Return the problem with the linear solvers that its scenes need for these parameters. A compiled program cannot
-    choose the solvers, because the values are unknown at compilation.
+    """Return the problem with the linear solvers that its scenes need for these parameters. The solvers must be chosen
+    before compilation, because a compiled program does not know the values of the parameters when it is compiled.
 
     Raises:
         InputError: the data name a step or a node that a scene does not have.

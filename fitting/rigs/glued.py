@@ -43,8 +43,8 @@ class Cells(NamedTuple):
 
     # Cell length [m] in a mesh of the whole cylinder (along the axis, up to twice this length); None: a graded sector.
     size: float | None = None
-    # In a sector: cell size at the rim of a plate, divided by the shortest dimension of the sample at this rim (radius,
-    # half the height, …).
+    # Only for a sector: cell size at the rim of a plate, divided by the shortest dimension of the sample near this rim
+    # (for example the radius or half the height).
     rim: float = 0.04
     edge: float = 0.02  # in a sector: cell size at the edge of a punch, divided by the shortest dimension at this edge
     largest: float = 0.34  # in a sector: longest cells, divided by the radius; along the axis, twice this length

@@ -369,8 +369,8 @@ def demodulate(run: Run, omega: Number, drive: Drive) -> tuple[jax.Array, jax.Ar
 def moduli(
     rig: Rig, law: Law, prony: Prony | None, omega: jax.Array, amplitude: jax.Array, drive: Drive = Drive()
 ) -> Moduli:
-    """Return G* = 2 h / (pi r^4) M / theta of many oscillations (section 5.3), with torque M and angle theta, in one
-    compiled program.
+    """Return G* = 2 h M / (pi r^4 theta) of many oscillations (chapter, section 5.3). One compiled program computes all
+    of them. The sample has height h and radius r, M is the torque, and theta is the angle.
 
     The moduli are divided by the bias of the mesh, `geometry_factor`. If only the isochoric part relaxes, the bias
     depends on the frequency, because the bulk modulus has more effect when the shear modulus has relaxed. If the rig

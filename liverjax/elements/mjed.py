@@ -57,7 +57,7 @@ def nodal_force(mesh: TetMesh, P: Matrix) -> jax.Array:
 
 @jax.jit
 def internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
-    """Return the gradient (V, 3) [N] of the total energy with respect to the positions: + dW/dx.
+    """Return dW/dx (V, 3) [N], the gradient of the total energy W with respect to the positions. The sign is plus.
 
     Args:
         mesh: `TetMesh`.

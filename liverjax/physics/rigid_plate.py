@@ -88,7 +88,8 @@ class RigidPlate(Physics):
     def enriched(self, mesh: TetMesh, more: Callable[[Any], Any]) -> "RigidPlate":
         """Return the plate with the nodes that the mesh of higher order adds between the nodes of the plate.
 
-        Cubic shape functions are not nodes and have no position. In a rigid motion of the plate, their unknowns are 0.
+        In a cubic mesh, the added numbers belong to cubic shape functions, not to nodes with a position. In a rigid
+        motion of the plate, the unknowns of these functions are 0.
         """
         nodes = more(self.nodes)
         return replace(self, nodes=nodes) if mesh.order < 3 else replace(self, still=nodes[len(self.nodes) :])
@@ -158,8 +159,8 @@ class Plate(NamedTuple):
     def not_given(self, mask: jax.Array, axes: jax.Array | None) -> tuple[jax.Array, jax.Array | None]:
         """Return the mask and the free directions `axes` (both (V, 3)), changed if the angle of the plate is given.
 
-        The mask is then 0 at the plate's nodes. If the plate can move along its axis, `axes` is this axis at these
-        nodes.
+        The mask is then 0 at the plate's nodes. If the plate can move along its axis, the returned `axes` contain the
+        direction of this axis at these nodes.
         """
         if self.plate.by == "torque":
             return mask, axes

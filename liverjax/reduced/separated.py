@@ -214,7 +214,8 @@ def _rank_one(tensor: np.ndarray) -> list[np.ndarray]:
     """Find the product of vectors, one for each axis, that is closest to a tensor. Return the unit vectors of all
     axes except the last."""
     n = tensor.ndim
-    # The iteration begins with the first singular vector of each axis.
+    # For each axis, the tensor is unfolded to a matrix with one row per index of this axis. The iteration begins with
+    # the first left singular vectors of these matrices.
     factors = [np.linalg.svd(np.moveaxis(tensor, a, 0).reshape(tensor.shape[a], -1))[0][:, 0] for a in range(n - 1)]
     last, size = tensor.shape[-1], 0.0
     w = np.zeros(last)

@@ -131,5 +131,6 @@ class Potential(NamedTuple):
     settled: Callable[[jax.Array], jax.Array] | None = None
     #: Number of unknowns that are positions; None: all unknowns are positions.
     positions: int | None = None
-    #: Whether a solve with a definite tangent eliminates the pressures. Such a solve needs only the usual tolerance.
+    #: Whether the pressures are eliminated when a linear system with the tangent from `definite` is solved. Such a
+    #: solve needs only the usual tolerance.
     eliminates: bool = False

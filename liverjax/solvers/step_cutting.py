@@ -1,11 +1,11 @@
 """Newton's method along a load: the solution is followed from the last equilibrium, if necessary in substeps.
 
 The residual r(q, s) contains the loads and prescribed motions at the beginning of the step for s = 0, and at its end
-for s = 1. At the beginning of a step, forces may be out of balance (inertia, a fluid). So the equation that is solved
-is r - (1 - s) r(start, 0) = 0, which holds at the beginning. A part of the load, from s to s + ds, is called a substep.
-Every substep begins with a linear solve, with the tangent at its beginning and the right-hand side -(r + dr/ds ds). So
-a prescribed motion enters through the tangent and not as a jump. If a substep fails, it is halved. Only the root at
-s = 1 is returned and differentiated.
+for s = 1. At the beginning of a step, forces may be out of balance (inertia, a fluid). So the equation r(q, s) - (1 -
+s) r(start, 0) = 0 is solved, where `start` contains the unknowns at the beginning of the step. For s = 0, its solution
+is q = start. A part of the load, from s to s + ds, is called a substep. Every substep begins with a linear solve, with
+the tangent at its beginning and the right-hand side -(r + dr/ds ds). So a prescribed motion enters through the tangent
+and not as a jump. If a substep fails, it is halved. Only the root at s = 1 is returned and differentiated.
 """
 
 from functools import partial
@@ -213,8 +213,9 @@ def _with_derivative(
 def _guarded(problem: Problem, q: jax.Array) -> jax.Array:
     """Return q. A derivative through this function is NaN on purpose: a correct derivative never passes through it.
 
-    Up to jax 0.10, the reverse-mode derivative of a derivative of a loop does not use the derivative rule of a root
-    (jax 0.11.2 does). That derivative would treat the root as a constant, and be wrong without a warning.
+    Suppose that a loop contains a root and is differentiated twice, the second time in reverse mode. Up to jax 0.10,
+    the second derivative does not use the derivative rule of the root (jax 0.11.2 does). That derivative would treat
+    the root as a constant, and be wrong without a warning.
     """
     leaves = [jnp.ravel(leaf)[:1] for leaf in jax.tree.leaves(problem.numbers)]
     some = [leaf for leaf in leaves if leaf.size and jnp.issubdtype(leaf.dtype, jnp.floating)]
@@ -480,8 +481,8 @@ def _direction(
 
     Return dq, the number of iterations, the new `kept`, and whether dr/dq seems positive definite.
 
-    `at` contains q, s and `by`, a result of `Problem.residual`. `when` contains two flags: whether a new tangent is
-    made, and whether a solution is needed (otherwise dq is 0).
+    `at` contains q, s and `by`. `by` is the third result of `Problem.residual`. `when` contains two flags: whether a
+    new tangent is made, and whether a solution is needed (otherwise dq is 0).
     """
     near, (renew, wanted) = (kept.made & ~kept.worn, kept.tangent), when
     q, s, by = at

@@ -136,8 +136,8 @@ def pack(A: Matrix) -> jax.Array:
 def stored(values: T) -> T:
     """Return a pytree with the same values, stored in memory (RAM).
 
-    A branch prevents XLA on the CPU from computing the values again for every use. The leaves are numbers or arrays. At
-    least one of them is not empty.
+    Without the branch (`lax.cond`) in this function, XLA on the CPU would compute the values again for every use. The
+    leaves are numbers or arrays. At least one of them is not empty.
     """
     values = jax.tree.map(jnp.asarray, values)
     number = max(jax.tree.leaves(values), key=jnp.size).ravel()[0]

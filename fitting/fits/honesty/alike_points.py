@@ -67,9 +67,10 @@ def alike_of(fit: Fit) -> Alike | None:
 
 
 def not_below(estimate: Estimate, natural_of: Callable, u: np.ndarray, root: np.ndarray) -> Estimate:
-    """Return the estimate for noise with another covariance of the p unknowns u. The error of a parameter due to noise
-    is replaced only if this covariance gives a larger error. Errors that are common to all points do not change.
-    `natural_of`: function from u to the parameters. `root`: square root (p, k) of the covariance, with k columns.
+    """Return the estimate with standard errors from another covariance of the p unknowns u, which allows for another
+    kind of noise. The error of a parameter due to noise is replaced only if this covariance gives a larger error.
+    Errors that are common to all points do not change. `natural_of`: function from u to the parameters. `root`: square
+    root (p, k) of the covariance, with k columns.
     """
     shared = np.zeros((len(estimate.values), 0)) if estimate.shared is None else estimate.shared
     noise = np.asarray(estimate.root)[:, : np.shape(estimate.root)[1] - shared.shape[1]]

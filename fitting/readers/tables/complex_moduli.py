@@ -61,8 +61,8 @@ def _of_frequency(path: str, column: Column, unit: str) -> float:
 
 
 def fault_of(column: Column, written: float, value: float, smallest: float, largest: float) -> tuple[str, str] | None:
-    """Return the fault of a value (in SI) and the remedy, or None if the value is good. The fault quotes the value as
-    written in the file."""
+    """Return what is wrong with a value (in SI) and how to correct it, or None if the value is good. The first text
+    quotes the value as written in the file."""
     if not np.isfinite(value):
         if np.isnan(written):
             return f"{column.name} is empty", "fill this cell, or remove the line"

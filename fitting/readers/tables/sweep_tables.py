@@ -182,8 +182,8 @@ _OF_DMA = re.compile(r"(static|dynamic|dyn\.?) (force|strain|stress|displacement
 
 
 def _perhaps_tensile(cells: list[str], columns: list[Column]) -> list[str]:
-    """Return a note if the headings of the moduli name neither shear nor tension, and another heading belongs to
-    tensile tests."""
+    """Return a note if the headings of the moduli name neither shear nor tension, but another heading is typical of a
+    DMA (tension, compression or bending)."""
     moduli = [c for c in columns if c.quantity in MODULI]
     sign = next((c for c in cells if _OF_DMA.search(c.replace("_", " ").strip('" '))), None)
     turned = any(re.search(r"torque|angle|drehmoment|winkel|m/rad", cell.lower()) for cell in cells)

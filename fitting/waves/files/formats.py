@@ -38,7 +38,7 @@ WAVES = ("displacement", "real", "imag", "phases", "wrapped")
 #: Name of the entry for the position of the voxels in space (3, 4) [m]: the vectors from voxel to voxel along the three
 #: axes, then the position of the first voxel. Only NIfTI files have this entry.
 PLACE = "(place)"
-#: Name of the entry for an error message if a file states two different voxel sizes.
+#: If a file states two different voxel sizes, the entry with this name contains the error message.
 CONFLICT = "(conflict)"
 #: Name of the entry for notes on arrays that are not used, but have names similar to a known name.
 NEARLY = "(nearly)"

@@ -5,7 +5,7 @@ import numpy as np
 from liverjax.core.errors import InputError
 
 #: If the phases of two neighbouring voxels differ by more than _STEEP times pi, a jump may be hidden. A note is given
-#: if this holds for more than the fraction _MANY of the neighbours.
+#: if the fraction of such pairs of neighbours is above _MANY.
 _STEEP, _MANY = 0.8, 0.01
 
 

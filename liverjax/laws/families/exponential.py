@@ -15,8 +15,8 @@ from liverjax.laws.base import Law
 class Exponential(Law):
     """W = c1 (exp(c2 (Xi(alpha) - 3)) - 1) + U(J).
 
-    Xi(alpha) = sum_m (J^(-1/3) lambda_m)^alpha, with the principal stretches lambda_m. Book chapter, Table 1 (with - 3
-    instead of - 1).
+    Xi(alpha) = sum_m (J^(-1/3) lambda_m)^alpha, with the principal stretches lambda_m. Source: Table 1 of the book
+    chapter, which prints - 1 where this formula has - 3.
     """
 
     c1: Number = param("Pa", "scale", above=0.0, typical=385.0)

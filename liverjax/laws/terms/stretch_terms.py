@@ -225,7 +225,7 @@ def _expanded_energy(law: Energies, logs: Vector, axes: Matrix, log_J0: Number, 
 def _energy_of_change(law: Energies, F: Matrix, frame: Frame, orders: int) -> tuple[Any, tuple]:
     """Return the energy as a function of a change Y of C, and Y itself.
 
-    Y is 0, but can be differentiated `orders` times with respect to F.
+    The value of Y is 0, but its derivatives with respect to F are those of C, up to the order `orders`.
     """
     logs, axes = frame
     log_J0 = jax.lax.stop_gradient(jnp.log(determinant(F)))

@@ -119,7 +119,7 @@ class Ligament(Physics):
         return np.asarray(self.nodes)[0, taut], f / lengths[taut, None]
 
     def pulls_single_nodes(self) -> bool:
-        """Return True: each fibre pulls at single nodes, or at the nodes of one element."""
+        """Return True: at each end, a fibre pulls at one node or at the nodes of one element, not on an area."""
         return True
 
     def is_straight_without_tension(self, mesh: TetMesh, x: jax.Array) -> bool:

@@ -74,7 +74,8 @@ class PressedObstacle(Obstacle):
             raise InputError(f"{name} force = {self.force} must be three numbers in N, not all 0: give a force")
 
     def check_place(self, mesh: TetMesh, name: str) -> None:
-        """Raise InputError as `Obstacle.check_place` does, and if the force moves the obstacle past the body."""
+        """Raise InputError in the same cases as `Obstacle.check_place`, and also if the obstacle misses the body when
+        the force moves it."""
         super().check_place(mesh, name)
         if not self._meets(mesh, contact_points):
             if self._meets(mesh, near_points):

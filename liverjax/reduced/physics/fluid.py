@@ -92,7 +92,7 @@ def porosity_at_points(model: ReducedModel, scene: Scene) -> Porosity:
 
 
 def fluid_at_rest(model: ReducedModel, scene: Scene) -> ReducedFluid:
-    """Return the state of the fluid at the beginning: the initial pressure, and a body without deformation."""
+    """Return the state of the fluid at the beginning, for the initial pressure and the undeformed body."""
     modes, porosity, S = model.pressures, scene.porosity, model.weights.shape[0]
     assert modes is not None and porosity is not None
     volumes = integrals(scene.mesh, jnp.ones_like(scene.mesh.weights))

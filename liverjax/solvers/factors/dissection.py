@@ -122,7 +122,8 @@ def _first_and_last(nodes: np.ndarray, span: tuple[np.ndarray, np.ndarray]) -> N
 
 
 def _work_of_cuts(nodes: np.ndarray, part: _Part, span: tuple[np.ndarray, np.ndarray], at: slice) -> np.ndarray:
-    """Estimate the work of cuts. A cut divides E ordered elements after one of the elements `at`.
+    """Estimate the work of the elimination for each of several possible cuts. A cut divides E ordered elements after
+    one of the elements `at`.
 
     `nodes` (n, E) are the n nodes of each element. The estimate is the work for the nodes that both sides share, plus
     twice the work of the next cut on each side. The next cut of a side with n nodes is assumed to contain n^(2/3)
