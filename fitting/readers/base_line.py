@@ -69,5 +69,5 @@ def _straight_line(time: np.ndarray, answer: np.ndarray) -> tuple[float, float, 
     square = float(off @ off)
     alike = min(max(float(off[1:] @ off[:-1]) / square, 0.0), 0.95) if square > 0 else 0.0
     variance = square / (len(time) - 2) * (1 + alike) / (1 - alike)
-    errors = np.sqrt(variance * np.diag(np.linalg.inv(A.T @ A)))
+    errors = np.sqrt(variance * np.diag(np.linalg.pinv(A.T @ A)))  # rounded times may all be equal
     return float(found[0]), float(found[1]), float(errors[0]), float(errors[1])
