@@ -10,8 +10,7 @@ from liverjax.core.struct import replace
 from liverjax.jobs import waves
 from liverjax.physics.porosity import Inlet
 from liverjax.scenes.scene_file import scene_from
-from liverjax.simulation import cautions
-from liverjax.simulation.run import Result
+from liverjax.simulation.unloaded import cautions_of_loaded
 from liverjax.waves.rest import under_its_weight
 
 pytestmark = pytest.mark.quick_to_compile
@@ -109,6 +108,5 @@ def test_a_region_that_relaxes_slowly_counts_in_a_loaded_shape():
     slow = {"where": {"x_min": 0.04}, "viscosity": {"ratios": [0.7], "relaxation_times": [20.0]}}
     for more, told in (({}, False), ({"region": [slow]}, True)):
         scene = scene_from(table | more)
-        result = Result(times=0.05 * np.arange(1, 11), positions=None, reactions=None, status=None, statistics=None)
-        said = cautions._of_stress_at_start(scene, result)
+        said = cautions_of_loaded(scene, jnp.asarray(0.05 * np.arange(1, 11)))
         assert bool(said) == told and (not told or "relaxation time is 20 s" in said[0])

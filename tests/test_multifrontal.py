@@ -24,7 +24,8 @@ def system(kind: type) -> tuple[scipy.sparse.csr_array, list[multifrontal.Front]
     """Return a symmetric matrix with two unknowns per node, neither definite nor well scaled, and its fronts."""
     rng = np.random.default_rng(1)
     box = lj.shapes.box((1.0, 1.0, 2.0), (5, 5, 10))
-    tets, points = np.asarray(box.tetrahedra).T, np.asarray(box.points)
+    # Sorted corners: the matrix does not depend on their order in the mesh.
+    tets, points = np.sort(box.tetrahedra, axis=1).T, np.asarray(box.points)
     at = np.concatenate([2 * tets, 2 * tets + 1])
     blocks = rng.normal(size=(8, 8, tets.shape[1])) + (
         1j * rng.normal(size=(8, 8, tets.shape[1])) if kind is complex else 0
@@ -92,7 +93,10 @@ def test_whole_numbers_of_16_bits_are_half_as_large():
     assert plain.nbytes - plain.matrix.data.nbytes == multifrontal.single_bytes(plan, A.dtype)
     rounded = [step.times(np.eye(len(step.after), dtype=np.complex64)[0]) for step in small.steps if len(step.after)]
     exact = [step.X[:, 0] for step in plain.steps if len(step.after)]
-    assert all(np.abs(a - b).max() < 1e-3 * np.abs(b).max() for a, b in zip(rounded, exact, strict=True))
+    # Real and imaginary part are rounded to 1/32767 of the largest number in the row.
+    most = [np.abs(step.X).max(axis=1) / 32767 for step in plain.steps if len(step.after)]
+    for a, b, unit in zip(rounded, exact, most, strict=True):
+        assert np.all(np.abs(a - b) < 0.75 * unit)  # sqrt(2) / 2, and the roundoff of single precision
 
 
 def test_a_matrix_without_an_inverse_is_told():
