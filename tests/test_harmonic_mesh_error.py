@@ -103,7 +103,8 @@ def test_mixed_elements_of_a_clamped_body(bulk):
 
     def scene(cells):
         mesh = lj.quadratic(lj.shapes.box((0.04, 0.02, 0.02), cells))
-        push = lj.Traction(triangles=mesh.triangle_sets["z_min"], value=jnp.array([0.0, 0.0, -5.0]))
+        top = lj.boundary.boundary_triangles(mesh, mesh.node_sets["z_min"])
+        push = lj.Traction(triangles=top, value=jnp.array([0.0, 0.0, -5.0]))
         return lj.Scene(
             mesh=mesh,
             law=lj.laws.NeoHookean(mu=2000.0, bulk=bulk),

@@ -421,7 +421,8 @@ def test_polystyrene_in_three_tests(tmp_path, capsys):
     assert main([str(first), "--with", *map(str, others), "--modes", "5", "--out", str(tmp_path)]) == 0
     content = json.loads((tmp_path / "fit.json").read_text())
     assert any("do not agree" in w for w in content["warnings"])
-    assert max(t["misfit"] for t in content["tests"]) < 0.4
+    # The sweep and the creep test differ by 40 %. The creep test has nearly all the weight, so the sweep is missed.
+    assert 0.3 < max(t["misfit"] for t in content["tests"]) < 0.5
 
 
 def test_one_measurement_does_not_count_twice(tmp_path, capsys):
