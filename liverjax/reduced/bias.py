@@ -41,17 +41,18 @@ def reduced_bias(
     """
     flat, shaped = ravel_pytree({name: jnp.asarray(value, float) for name, value in values.items()})
 
-    def answer(numbers: jax.Array) -> jax.Array:
+    def answer(numbers: jax.Array) -> tuple[jax.Array, jax.Array]:
         own = with_parameters(scene, shaped(numbers))
-        return jnp.ravel(observed(reduced_positions(model, own, simulate_reduced(model, own))))
+        run = simulate_reduced(model, own)
+        return jnp.ravel(observed(reduced_positions(model, own, run))), run.status
 
-    run = jax.jit(simulate_reduced)(model, with_parameters(scene, shaped(flat)))
-    failed = np.flatnonzero(np.asarray(run.status) != status.CONVERGED)
+    found_by_model, codes = jax.jit(answer)(flat)
+    failed = np.flatnonzero(np.asarray(codes) != status.CONVERGED)
     if failed.size:
         raise RuntimeError(f"the reduced run did not converge in step {failed[0] + 1}: use the full model")
     full = simulate(with_parameters(scene, shaped(flat))).check()
-    off = np.asarray(jnp.ravel(observed(full.positions)) - jax.jit(answer)(flat))
-    J = np.asarray(jax.jit(jax.jacfwd(answer))(flat))
+    off = np.asarray(jnp.ravel(observed(full.positions)) - found_by_model)
+    J = np.asarray(jax.jit(jax.jacfwd(lambda numbers: answer(numbers)[0]))(flat))
     # The parameters have different units, so the columns of J are scaled to length 1.
     size = np.linalg.norm(J, axis=0)
     size = np.where(size > 0, size, 1.0)
