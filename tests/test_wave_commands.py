@@ -184,7 +184,7 @@ def test_a_map_that_was_stopped_goes_on_to_the_same_end(tmp_path, monkeypatch):
         assert a["evidence"] == pytest.approx(b["evidence"], rel=1e-9)
 
 
-@pytest.mark.parametrize("other", ["length", "density", "noise", "frequencies", "displacements"])
+@pytest.mark.parametrize("other", ["length", "density", "noise", "frequencies", "displacements", "moduli of the organ"])
 def test_a_map_goes_on_from_its_own_problem_alone(tmp_path, other):
     own, file, length, w = organ(noise=5e-7), tmp_path / "progress.h5", 0.01, organ(noise=5e-7).waves
     course = stiffness_map.course_of(own.body, own.matrices, w, modulus(HERTZ), length)
@@ -194,7 +194,8 @@ def test_a_map_goes_on_from_its_own_problem_alone(tmp_path, other):
     changed = {"noise": "sd", "frequencies": "omega", "displacements": "motion"}.get(other)
     if changed:
         w = w._replace(**{changed: 1.01 * getattr(w, changed)})
-    different = stiffness_map.course_of(own.body, m, w, modulus(HERTZ), 0.02 if other == "length" else length)
+    whole = (1.01 if other == "moduli of the organ" else 1.0) * modulus(HERTZ)
+    different = stiffness_map.course_of(own.body, m, w, whole, 0.02 if other == "length" else length)
     with pytest.raises(InputError, match=rf"belongs to another fit \({other} differs?\): remove --resume"):
         stiffness_map._first_or_resumed(different, file)
 

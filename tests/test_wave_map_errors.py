@@ -19,11 +19,16 @@ def _modulus(z):
     return 3000 * np.exp(1.2 * np.exp(-(((z - 0.028) / 0.009) ** 2))) * (1 + 0.3j)
 
 
-def _shear_waves():
+def _edge(z):
+    """A step [Pa] within an element, from 3 to 5 kPa."""
+    return np.where(z < 0.0265, 3000, 5000) * (1 + 0.3j)
+
+
+def _shear_waves(modulus=_modulus):
     """Waves (1, *SHAPE, 3) along z that are polarised along x and y: the exact motion, by fine finite differences."""
     fine = 40
     n, dz, omega = (SHAPE[2] - 1) * fine, STEP / fine, 2 * np.pi * HERTZ
-    g = _modulus((np.arange(n) + 0.5) * dz) / dz**2
+    g = modulus((np.arange(n) + 0.5) * dz) / dz**2
     middle = np.concatenate([[1], DENSITY * omega**2 - g[:-1] - g[1:], [1]])
     bands = [np.append(g[:-1], 0), middle, np.append(0, g[1:])]
     A = scipy.sparse.diags_array(bands, offsets=[-1, 0, 1], shape=(n + 1, n + 1)).tocsc()
@@ -65,3 +70,17 @@ def test_deviations_of_a_map_hold_the_truth_behind_a_filter(width):
         told = cautions.cautions_of_elastography(organ, found, drawn)
         assert any("deviations of the map are enlarged" in s for s in told) == bool(width)
     assert np.mean(held) > 0.86
+
+
+@pytest.mark.parametrize("modulus", [_edge, _modulus, lambda z: np.full(np.shape(z), 3000 + 900j)])
+def test_edges_in_a_map_are_told(modulus):
+    """Near an edge, 90 % intervals may contain fewer than 90 % of the true values."""
+    U = _shear_waves(modulus) + 1e-7 * _noise(0, 1)
+    field = wave_field.WaveField(
+        np.array([HERTZ]), U, np.full(3, STEP), np.zeros(3), np.ones(SHAPE, bool), None, np.full(1, 1e-7)
+    )
+    organ = elastography.organ_of(field, elastography.body_of(field), DENSITY)
+    found = elastography.regions_of(organ)
+    drawn = stiffness_map.map_of(elastography.problem_of_map(organ, found, 4 * STEP))
+    told = cautions.cautions_of_elastography(organ, found, drawn)
+    assert any("within 8 mm. Near such an edge" in s for s in told) == (modulus in (_edge, _modulus))

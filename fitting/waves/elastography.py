@@ -228,7 +228,7 @@ def plane_waves() -> list[tuple[np.ndarray, np.ndarray]]:
 
 def waves_of_field(field: WaveField) -> np.ndarray:
     """Return the relative energies (F, 2 D) of the 2 D `plane_waves` in the displacement, at F frequencies. The sum at
-    each frequency is 1.
+    each frequency is 1. Only voxels in the mask are used.
 
     The energy of a direction n is (sum over the axes a of n_a^2 times the mean squared derivative along axis a) to the
     power `SHARPNESS`. This energy is divided between the two waves of this direction, in proportion to the squared
@@ -237,7 +237,8 @@ def waves_of_field(field: WaveField) -> np.ndarray:
     """
     waves = plane_waves()
     rows = []
-    for u, noise in zip(field.displacement, field.noise, strict=True):
+    for whole, noise in zip(field.displacement, field.noise, strict=True):
+        u = np.where(field.mask[..., None], whole, np.nan)
         steep = np.empty((3, 3, 3))  # mean products of the derivatives of two components, for each axis
         for axis in range(3):
             slope = np.diff(u, axis=axis).reshape(-1, 3)

@@ -9,6 +9,11 @@ the prior mean 0 and the prior standard deviation `LEVEL`. The levels are needed
 g_f may be wrong if the organ is not uniform. With only one frequency there is no level, because a level would have the
 same effect as the mean of c.
 
+The data depend only on the means of the field over the elements. A field with opposite signs at neighbouring corners
+has the mean 0 in every element, so the data do not determine such a field. Beside a jump of the modulus, the most
+probable field contains it. Therefore the map at a corner is not the value of the field there, but the mean of c over
+the elements around this corner.
+
 The prior standard deviation of c is increased step by step. The increase ends when chi^2 is as low as the number of
 equations (discrepancy principle; Morozov 1966), or when the logarithm of the evidence, -(chi^2/n + |z|^2)/2 - ln det H,
 decreases. Here z is the whitened field: c and the levels, transformed so that the prior covariance is the unit matrix.
@@ -65,6 +70,7 @@ class WaveMap(NamedTuple):
     sd: np.ndarray  # (F, P) complex. Real part: sd of ln |G|; imaginary part: sd of the loss angle
     posterior_sd: np.ndarray  # (F, P) sd of real and of imaginary part of c + l_f, without uncertainty of positions
     prior_sd: np.ndarray  # (F, P) sd of the same quantities before the data are used
+    change: np.ndarray  # (P,) change of ln |G| over the width w along the gradient of the map
     draws: np.ndarray  # (D, F, P) complex: D posterior samples of c + l_f, moved by random parts of the width w
     modulus: np.ndarray  # (F, P) complex [Pa]
     deviation: float  # chosen prior standard deviation of c
@@ -90,6 +96,8 @@ class Course(NamedTuple):
     # 3 matrices (P, P). The product with c (the field of the exponent at the corners) gives the change of c along x, y
     # or z over w, the width over which the prior smooths a jump.
     slopes: tuple[scipy.sparse.csr_array, ...]
+    # Matrix (P, P): its product with c gives the means of c over the elements around each corner.
+    around: scipy.sparse.csr_array
     p: smooth.Prior
     length: float  # correlation length of the prior [m]
     voxel: np.ndarray | None = None  # (V, 3) voxel index of each node; None: white noise is assumed
@@ -140,7 +148,7 @@ class Course(NamedTuple):
 
     def by_frequency(self, y: np.ndarray) -> np.ndarray:
         """Return c + l_f at the corners (F, P, …), from y (P + L, …)."""
-        c, levels = y[: self.corners], y[self.corners :]
+        c, levels = self.around @ y[: self.corners], y[self.corners :]
         return c[None] + (levels[:, None] if len(levels) else np.zeros((1, 1, *y.shape[1:])))
 
     def marks(self) -> dict[str, object]:
@@ -153,6 +161,7 @@ class Course(NamedTuple):
             "spacing": mark_of(m.shear[..., :1]),
             "frequencies": mark_of(w.omega),
             "noise": mark_of(w.sd),
+            "moduli of the organ": mark_of(self.whole),
             "displacements": mark_of(w.motion, m.unknowns),
         }
 
@@ -186,8 +195,8 @@ def course_of(body: VoxelBody, m: Matrices, waves: MeasuredWaves, whole: np.ndar
     levels = np.eye(number) if number > 1 else np.zeros((1, 0))
     every = np.ones((mean.shape[0], 1))
     exponents = tuple(scipy.sparse.hstack([mean, scipy.sparse.csr_array(every * own)], "csr") for own in levels)
-    slopes = _changes_over_slopes(body, mean, length)
-    return Course(m, waves, np.asarray(whole, complex), exponents, slopes, p, length, body.voxel)
+    slopes, around = _changes_over_slopes(body, mean, length), (_mean_around(body, mean) @ mean).tocsr()
+    return Course(m, waves, np.asarray(whole, complex), exponents, slopes, around, p, length, body.voxel)
 
 
 def map_of(
@@ -228,6 +237,7 @@ def map_of(
         sd=_with_place(after, slopes.real) + 1j * _with_place(after, slopes.imag),
         posterior_sd=after,
         prior_sd=before,
+        change=np.linalg.norm([D @ exponent[0].real for D in course.slopes], axis=0),
         draws=exponent + departures + place[:, None],
         modulus=course.whole[:, None] * np.exp(exponent),
         deviation=DEVIATIONS[point.k],
@@ -263,6 +273,12 @@ def _mean_of_corners(body: VoxelBody) -> scipy.sparse.csr_array:
     return scipy.sparse.csr_array((np.full(rows.size, 0.25), (rows, tets.ravel())), shape=shape)
 
 
+def _mean_around(body: VoxelBody, mean: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
+    """Return the matrix (P, E) of the means over the elements around each corner, weighted by volume."""
+    volumes = np.asarray(body.whole.volumes)
+    return (scipy.sparse.diags_array(1 / (mean.T @ volumes)) @ mean.T @ scipy.sparse.diags_array(volumes)).tocsr()
+
+
 def _changes_over_slopes(
     body: VoxelBody, mean: scipy.sparse.csr_array, length: float
 ) -> tuple[scipy.sparse.csr_array, ...]:
@@ -271,16 +287,16 @@ def _changes_over_slopes(
 
     The gradient at a corner is the mean over the elements around this corner, weighted by volume.
     """
-    tets, volumes = np.asarray(body.whole.tetrahedra), np.asarray(body.whole.volumes)
+    tets = np.asarray(body.whole.tetrahedra)
     D = np.moveaxis(np.asarray(body.whole.shape_vectors), -1, 0)
     gradients = np.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)  # (E, 4, 3)
-    around = scipy.sparse.diags_array(1 / (mean.T @ volumes)) @ mean.T @ scipy.sparse.diags_array(volumes)
     over = np.maximum(np.ptp(np.asarray(body.whole.points)[tets[0]], axis=0), length)
     rows, columns = np.repeat(np.arange(len(tets)), 4), tets.ravel()
     of_elements = [
         scipy.sparse.csr_array((w * gradients[:, :, a].ravel(), (rows, columns)), shape=mean.shape)
         for a, w in enumerate(over)
     ]
+    around = _mean_around(body, mean)
     return tuple((around @ own).tocsr() for own in of_elements)
 
 
@@ -447,7 +463,8 @@ def _spread(
         """Yield c + l_f at the corners (P, n) for one frequency after another. All frequencies together would need too
         much memory."""
         levels = y[course.corners :]
-        return (y[: course.corners] + level for level in (levels if len(levels) else [0.0]))
+        c = course.around @ y[: course.corners]
+        return (c + level for level in (levels if len(levels) else [0.0]))
 
     def deviations(y: np.ndarray) -> np.ndarray:
         return np.stack([np.sqrt(np.sum(own.real**2 + own.imag**2, axis=1)) for own in each(y)])

@@ -56,9 +56,9 @@ def order_sentence(field: WaveField) -> str | None:
 
 
 def _central_differences(field: WaveField) -> np.ndarray:
-    """Return central differences d_a u_c (3, 3, n) at voxels with six measured neighbours. The differences are scaled
-    to a root mean square of 1 at each frequency."""
-    U, rows = field.displacement, []
+    """Return central differences d_a u_c (3, 3, n) at voxels with six measured neighbours in the mask. The differences
+    are scaled to a root mean square of 1 at each frequency."""
+    U, rows = np.where(field.mask[..., None], field.displacement, np.nan), []
     middle = tuple(slice(1, -1) for _ in range(3))
     for u in U:
         each = []
