@@ -352,6 +352,21 @@ def test_a_wrong_shape_is_told_behind_a_long_approach(tmp_path, capsys):
     assert "a half-angle of 45 degrees is assumed" in told and "--radius is for a sphere or a punch" in told
 
 
+def test_depths_near_the_end_of_the_table_are_fitted(tmp_path, capsys):
+    """The search tried earlier contact points, for which the table has no forces, and refused the curve."""
+    layer, file = Layer(Indenter("sphere", 2e-4, 0.5, 0.01)), tmp_path / "layer.csv"
+    ask = ["indentation", str(file), "--shape", "sphere", "--radius", "0.01", "--thickness", "0.0002"]
+    ask += ["--out", str(tmp_path / "out")]
+    for part, code in ((0.95, 0), (1.3, 2)):
+        depth = np.linspace(-1e-5, part * layer.deepest, 60)
+        force = E * layer.force(np.minimum(depth, layer.deepest)) * np.maximum(1, depth / layer.deepest) ** 3
+        rows = "\n".join(f"{d:.9g},{f:.9g}" for d, f in zip(depth, force, strict=True))
+        file.write_text(f"depth_m,force_N\n{rows}\n")
+        assert main(ask) == code
+    assert json.loads((tmp_path / "out" / "fit.json").read_text())["young_modulus"] == pytest.approx(E, rel=1e-6)
+    assert "m or more after contact, but for this layer and indenter only depths up to" in capsys.readouterr().err
+
+
 def test_an_approach_as_long_as_the_layer_is_thick_is_fitted():
     """The search also tries contact points before the first reading. Only there are depths larger than the
     thickness.

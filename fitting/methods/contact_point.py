@@ -17,6 +17,8 @@ from fitting.methods.noise.alike_noise import Alike, along_rows
 from fitting.methods.noise.uneven_noise import uneven_root
 
 _GRID = 200
+#: Distance of neighbouring contact points for a central difference, divided by the range of the depths.
+_NEIGHBOUR = 1e-5
 #: If the noise, divided by the largest fitted force, is below this value, the residuals are roundoff.
 _NOISELESS = 1e-7
 
@@ -51,7 +53,11 @@ BASES = ("zero", "constant", "line")
 
 
 def fit_contact(
-    depth: np.ndarray, force: np.ndarray, unit_force: Callable[[np.ndarray], np.ndarray], base: str = "zero"
+    depth: np.ndarray,
+    force: np.ndarray,
+    unit_force: Callable[[np.ndarray], np.ndarray],
+    base: str = "zero",
+    deepest: float = np.inf,
 ) -> ContactFit:
     """Fit modulus and contact point by least squares of the force.
 
@@ -62,8 +68,11 @@ def fit_contact(
             from the contact point. Before contact, these depths are negative.
         base: model of the force without contact: "zero", "constant" (unknown offset of the sensor) or "line" (the
             sensor also drifts).
+        deepest: largest depth [m] from the contact point for which `unit_force` is known. Earlier contact points are
+            not tried.
     """
     span = float(np.ptp(depth))
+    h = _NEIGHBOUR * span
     line = np.stack([np.ones(len(depth)), (depth - depth.mean()) / span], axis=1)[:, : BASES.index(base)]
 
     def linear(start: float) -> tuple[np.ndarray, np.ndarray]:
@@ -79,7 +88,8 @@ def fit_contact(
         return float(np.sum((force - A @ numbers) ** 2))
 
     # The contact point may lie before the first measured depth, but not after the last one.
-    grid = np.linspace(depth.min() - 0.5 * span, depth.max() - 1e-3 * span, _GRID)
+    earliest = max(depth.min() - 0.5 * span, depth.max() - deepest + 2 * h)
+    grid = np.linspace(earliest, depth.max() - 1e-3 * span, _GRID)
     k = int(np.argmin([misfit(start) for start in grid]))
     low, high = grid[max(k - 1, 0)], grid[min(k + 1, _GRID - 1)]
     start = float(
@@ -87,7 +97,6 @@ def fit_contact(
     )
     numbers, A = linear(start)
     E = float(numbers[0])
-    h = 1e-5 * span
     slope = (unit_force(depth - start - h) - unit_force(depth - start + h)) / (2 * h)
     # Derivatives with respect to ln E, d0 / span, and the base line's coefficients divided by the largest force.
     J = np.column_stack([A[:, 0] * E, E * slope * span, line * np.abs(force).max()])
@@ -131,13 +140,24 @@ _SEEN, _CLEAR = 2.0, 4.0
 _LEVEL = 0.1
 
 
-def fit_with_offset(depth: np.ndarray, force: np.ndarray, unit_force: Callable[[np.ndarray], np.ndarray]) -> ContactFit:
+def beyond(fit: ContactFit, depth: np.ndarray, deepest: float) -> bool:
+    """Return whether the contact point lies at the limit that `deepest` sets (see `fit_contact`)."""
+    return bool(depth.max() - fit.contact_point > deepest - 3 * _NEIGHBOUR * np.ptp(depth))
+
+
+def fit_with_offset(
+    depth: np.ndarray,
+    force: np.ndarray,
+    unit_force: Callable[[np.ndarray], np.ndarray],
+    deepest: float = np.inf,
+) -> ContactFit:
     """Fit modulus and contact point. If enough points are before contact, the offset of the sensor is fitted too.
 
     The zero of a force sensor is never exact. The error of this zero moves the contact point more than the noise does.
     Without points before contact, offset and contact point cannot be distinguished. Then the offset is assumed to be 0.
+    Arguments: see `fit_contact`.
     """
-    plain, free = (fit_contact(depth, force, unit_force, base) for base in BASES[:2])
+    plain, free = (fit_contact(depth, force, unit_force, base, deepest) for base in BASES[:2])
     if free.before < _FEWEST or not free.modulus > 0:
         return plain
     # If the offset is large, the fit without an offset explains it as a contact force and has no points before contact.
@@ -158,19 +178,23 @@ def _slope_and_error(depth: np.ndarray, force: np.ndarray) -> tuple[float, float
 
 
 def fit_without_tilt(
-    depth: np.ndarray, force: np.ndarray, unit_force: Callable[[np.ndarray], np.ndarray], plain: ContactFit
+    depth: np.ndarray,
+    force: np.ndarray,
+    unit_force: Callable[[np.ndarray], np.ndarray],
+    plain: ContactFit,
+    deepest: float = np.inf,
 ) -> ContactFit | None:
     """Fit the curve with a tilted base line if the force rises or falls before contact and the fit of the whole curve
     confirms this tilt. Otherwise return None.
 
     Args:
-        depth, force, unit_force: see `fit_contact`.
+        depth, force, unit_force, deepest: see `fit_contact`.
         plain: fit without a tilt of the base line.
     """
     free = depth < depth.min() + _FREE * (plain.contact_point - depth.min())
     if free.sum() < _FEWEST or not np.ptp(depth[free]) > 0:
         return None
     slope, error = _slope_and_error(depth[free], force[free])
-    level = fit_contact(depth, force, unit_force, "line")
+    level = fit_contact(depth, force, unit_force, "line", deepest)
     seen = abs(slope) > _SEEN * error and slope * level.tilt > 0
     return level if seen and abs(level.tilt) > _CLEAR * level.tilt_error else None
