@@ -49,7 +49,7 @@ def numbers(values: Any) -> Any:
 
 def summary(fit: Fit, sweep: Sweep) -> Content:
     """Return the content of fit.json for one fit (closed form or simulation)."""
-    u, n = fit.uncertainty, fit.modes
+    u, n, omega = fit.uncertainty, fit.modes, sweep.angular_frequency
     errors = fit.relative_errors(sweep)
     e = u.standard_errors
     limiting = limits.limit_errors(u, fit.model, fit.parameters)
@@ -78,7 +78,7 @@ def summary(fit: Fit, sweep: Sweep) -> Content:
         "mean_relative_error": float(errors.mean()),
         "max_relative_error": float(errors.max()),
         "shear_waves": shear_waves.waves_of_moduli(
-            fit.storage, fit.loss, sweep.angular_frequency, fit.details.get("density_kg_m3")
+            *moduli_errors.moduli_of_model(fit, fit.solution.u, omega), omega, fit.details.get("density_kg_m3")
         ),
         "warnings": list(fit.warnings),
         "run_time_s": fit.run_time,

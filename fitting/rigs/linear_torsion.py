@@ -127,7 +127,7 @@ def rest_masses(rig: Rig) -> jax.Array:
     is free), then of the plate's rotation."""
     assert rig.density is not None
     mass = rig.density * nodal_volumes(rig.mesh)
-    plate, X = mass[-rig.top :], rig.mesh.points[-rig.top :]
+    plate, X = mass[-rig.top :], (rig.mesh.points if rig.held is None else rig.held)[-rig.top :]
     turn = jnp.sum(plate * (X[:, 0] ** 2 + X[:, 1] ** 2)) / rig.radius**2
     last = [jnp.sum(plate), turn] if rig.free_height else [turn]
     return jnp.concatenate([jnp.repeat(mass[rig.bottom : -rig.top], 3), jnp.stack(last)])

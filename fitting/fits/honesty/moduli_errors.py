@@ -82,11 +82,16 @@ def _shared_errors(fit: Fit, omega: np.ndarray) -> np.ndarray:
     return (slope @ shared).T
 
 
+def moduli_of_model(fit: Fit, u: Array, omega: np.ndarray) -> tuple[Array, Array]:
+    """Return G' and G'' (n,) [Pa] of the fitted material for the unknowns u of the fit. For a compressed sample, these
+    are the moduli at rest."""
+    own = fit.kind.moduli
+    return generalised_maxwell.moduli(fit.kind.maxwell(u), omega) if own is None else own(u, omega)
+
+
 def _of_one_model(fit: Fit, omega: np.ndarray, noise_given: bool) -> Estimate:
     def of(u: Array) -> Array:
-        own = fit.kind.moduli
-        halves = generalised_maxwell.moduli(fit.kind.maxwell(u), omega) if own is None else own(u, omega)
-        return arrays_of(u).concatenate(halves, axis=-1)
+        return arrays_of(u).concatenate(moduli_of_model(fit, u, omega), axis=-1)
 
     names = [f"{part} at {at:.3g} rad/s" for part in ("storage", "loss") for at in omega]
     found = estimated(names, of, fit.solution, 2 * len(fit.storage), noise_given, fit.kind.effective)
