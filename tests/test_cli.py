@@ -14,8 +14,10 @@ import pytest
 from conftest import ROOT
 
 from fitting.__main__ import main
+from fitting.commands import waves
 from fitting.fits import sample_inertia
 from liverjax.__main__ import main as liverjax_main
+from liverjax.commands import exit_codes
 from liverjax.commands.arguments import with_joined_numbers
 
 pytestmark = pytest.mark.quick_to_compile
@@ -201,6 +203,15 @@ def test_output_folder_that_is_a_file(tmp_path, capsys):
     (tmp_path / "out" / "fit.h5").mkdir(parents=True)
     assert main([str(PORCINE), "--out", str(tmp_path / "out")]) == 2
     assert "contains a folder fit.h5" in capsys.readouterr().err
+
+
+def test_files_of_an_earlier_run_are_found_by_pattern(tmp_path, capsys):
+    """waves writes a sweep for each region. The regions of a second run may be others."""
+    for name in ("sweep_1.csv", "sweep_whole.csv"):
+        (tmp_path / name).write_text("")
+    begin = max(f.stat().st_mtime for f in tmp_path.iterdir()) + 1
+    exit_codes._tell_of_earlier_files(waves.parser("waves").parse_args(["x.npz", "--out", str(tmp_path)]), begin)
+    assert f"note: sweep_1.csv, sweep_whole.csv in {tmp_path} are from an earlier run" in capsys.readouterr().err
 
 
 def test_what_an_earlier_run_left_is_told(tmp_path, capsys):

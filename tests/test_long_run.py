@@ -232,6 +232,14 @@ def test_a_killed_process_loses_no_finished_part(scene, tmp_path):
     assert len(_numbers(tmp_path / "result.h5")["times"]) == 10
 
 
+@pytest.mark.parametrize("content", ["", '{"scene": "fir', "[1]", "\0" * 40])
+def test_a_damaged_file_with_the_input_is_told(tmp_path, content):
+    """It was a traceback of the JSON reader."""
+    (tmp_path / "run.json").write_text(content)
+    with pytest.raises(lj.InputError, match=r"run\.json is damaged, so the input of the parts is unknown"):
+        resumable_parts.same({"scene": "first"}, tmp_path / "run.json")
+
+
 def test_a_kill_while_parts_are_removed_leaves_no_parts_of_unknown_input(tmp_path, monkeypatch):
     """The file with the input went first, and --resume put the remaining parts into the run of another scene."""
     folder = tmp_path / "result.h5.parts"

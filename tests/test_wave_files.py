@@ -11,6 +11,7 @@ from test_wave_commands import written
 from test_waves import HERTZ, H, plane_waves
 
 from fitting.waves import wave_field
+from fitting.waves.files import formats
 from liverjax.core.errors import InputError
 
 pytestmark = pytest.mark.quick_to_compile
@@ -414,3 +415,17 @@ def test_arrays_of_nearly_known_names_are_told(tmp_path):
     np.savez(tmp_path / "waves.npz", **arrays)
     with pytest.raises(InputError, match=r"no waves.*'Displacement' is not used: did you mean displacement"):
         wave_field.read_waves(tmp_path / "waves.npz")
+
+
+def test_rounded_positions_are_on_the_grid(tmp_path):
+    """A turn of the axes in single precision moves positions by nanometres. These were taken for steps of the grid."""
+    index = np.stack(np.unravel_index(np.arange(5 * 6 * 7), (5, 6, 7)), axis=1)
+    exact, rng = index * np.array([0.002, 0.0025, 0.003]), np.random.default_rng(0)
+    for jitter in (4e-9, 2e-5):
+        places = exact + rng.uniform(-jitter, jitter, exact.shape)
+        at, spacing, _, shape = formats._grid(tmp_path, places)
+        np.testing.assert_array_equal(at, index)
+        np.testing.assert_allclose(spacing, [0.002, 0.0025, 0.003], rtol=0.01)
+        assert shape == (5, 6, 7)
+    with pytest.raises(InputError, match="is not on a regular grid"):
+        formats._grid(tmp_path, exact + rng.uniform(-2e-4, 2e-4, exact.shape))

@@ -81,7 +81,8 @@ def end_if_stopped(code: int) -> None:
 def _tell_of_earlier_files(options: argparse.Namespace, begin: float) -> None:
     """Print a note with the optional files in the folder of results that are older than this run. `begin`: time at
     which this run began."""
-    names = [name for name in getattr(options, "optional_files", ()) if _older(options.out / name, begin)]
+    known = (path for name in getattr(options, "optional_files", ()) for path in sorted(options.out.glob(name)))
+    names = [path.name for path in known if _older(path, begin)]
     if names:
         verb = "is" if len(names) == 1 else "are"
         print(f"note: {', '.join(names)} in {options.out} {verb} from an earlier run", file=sys.stderr)

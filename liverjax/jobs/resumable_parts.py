@@ -92,7 +92,8 @@ def same(identity: Mapping[str, object], file: Path) -> None:
     """Store the input that determines the results, or compare it with the input that is already stored.
 
     Raises:
-        InputError: the parts next to `file` were made with other input, or their input is unknown.
+        InputError: the parts next to `file` were made with other input, or their input is unknown, or `file` is
+            damaged.
     """
     identity = json.loads(json.dumps(identity))
     if not file.exists():
@@ -104,7 +105,13 @@ def same(identity: Mapping[str, object], file: Path) -> None:
         with whole(file, f".{os.getpid()}") as new:
             new.write_text(json.dumps(identity))
         return
-    for key, value in json.loads(file.read_text()).items():
+    try:
+        stored = dict(json.loads(file.read_text()))
+    except (ValueError, TypeError):
+        raise InputError(
+            f"{file} is damaged, so the input of the parts is unknown: give another --out, or remove {file.parent}"
+        ) from None
+    for key, value in stored.items():
         if identity.get(key) != value:
             raise InputError(
                 f"{file.parent} contains parts of another {file.stem} (not the same {key}): give another --out, or "

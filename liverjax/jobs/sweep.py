@@ -285,7 +285,9 @@ def _already(sweep: Sweep, out: Path, resume: bool) -> Done:
             if json.loads(file.attrs["sweep"]) != json.loads(json.dumps(sweep.identity)):
                 raise InputError(f"{out} belongs to another sweep: give another --out, or remove this file")
             codes, J = file["status"][:], file["volume_ratios"][:]
-    except (OSError, KeyError):
+    except InputError:
+        raise
+    except (OSError, KeyError, ValueError, TypeError):
         raise InputError(f"{out} is not the result of a sweep: give another --out, or remove this file") from None
     return Done(out, _failures(sweep, codes), 0, _crushed(sweep, codes, J))
 

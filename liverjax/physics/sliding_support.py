@@ -76,7 +76,7 @@ def on_plane(mesh: TetMesh, nodes: np.ndarray, name: str = "support") -> Sliding
         InputError: the nodes do not span a plane, or do not lie in one plane.
     """
     points = np.asarray(mesh.points)[nodes]
-    size, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=True)[1:]
+    size, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[1:]
     if len(points) < 3 or size[1] <= _FLAT * size[0]:
         raise InputError(f"{name} where selects nodes that do not span a plane: enlarge the region to a whole face")
     off = np.abs((points - points.mean(axis=0)) @ axes[2]).max()

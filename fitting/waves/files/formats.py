@@ -287,6 +287,10 @@ def _quick_number(text: str, between: str) -> float | None:
         return to_number(text, between)
 
 
+#: Steps between positions that are shorter than this fraction of the longest step are errors of the positions.
+_JITTER = 0.05
+
+
 def _grid(path: Path, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]:
     """Return the grid indices (n, 3) of the points X (n, 3) [m], and the spacing [m], origin [m] and shape of their
     regular grid."""
@@ -299,6 +303,7 @@ def _grid(path: Path, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
         steps = np.diff(np.unique(np.round(X[:, a], 9)))
         if not len(steps):
             raise InputError(f"{path}: all voxels have the same {'xyz'[a]}; waves need a volume, not a single slice")
+        steps = steps[steps > _JITTER * steps.max()]
         spacing[a] = steps[steps < 1.5 * steps.min()].mean()
     origin = X.min(axis=0)
     # Positions in a file are rounded, so the total length gives a more exact spacing than single steps.
