@@ -73,6 +73,16 @@ def test_surfaces_of_elements_are_groups_of_triangles(tmp_path, order):
         lj.read_mesh(tmp_path / "m.inp")
 
 
+def test_a_surface_may_have_the_name_of_a_set_of_elements(tmp_path):
+    """In Abaqus they are different kinds of names. The surface replaced the elements of the set."""
+    cards = "*ELSET, ELSET=BOTTOM\n102,\n*SURFACE, NAME=BOTTOM\nBOTTOM, S1\n*SURFACE, NAME=other\n101, S2\n"
+    (tmp_path / "m.inp").write_text(HEAD + cards)
+    mesh = lj.read_mesh(tmp_path / "m.inp")
+    assert np.asarray(mesh.element_sets["BOTTOM"]).tolist() == [1]
+    assert np.sort(np.asarray(mesh.triangle_sets["BOTTOM"])).tolist() == [[1, 2, 4]]
+    assert np.sort(np.asarray(mesh.triangle_sets["other"])).tolist() == [[0, 1, 3]]
+
+
 @pytest.mark.parametrize(
     ("cards", "members"),
     [

@@ -179,6 +179,30 @@ def test_waves_without_a_mass_are_told():
     assert cautions_of_waves(varied) == []
 
 
+@pytest.mark.parametrize(
+    ("change", "mu", "hertz", "said"),
+    [
+        # G*/G0 = 0.101 + 0.034i: the relaxed body has short waves.
+        (
+            {"viscosity": lj.Prony(ratios=jnp.array([0.9]), relaxation_times=jnp.array([1e-4]))},
+            1e4,
+            [60.0],
+            "at 60 Hz shear waves are about",
+        ),
+        # |G*/G0| = 6.9: the waves are 45 mm long.
+        ({"springpots": lj.SpringpotSeries(times=jnp.array([0.1]), exponents=jnp.array([0.5]))}, 1e3, [60.0], ""),
+        ({}, 1e4, [600.0, 60.0, 20.0], "at 600 Hz shear waves are about 0.0051 m long"),
+    ],
+)
+def test_viscosity_makes_waves_shorter_or_longer(change, mu, hertz, said):
+    """The length of the waves was that of the elastic body."""
+    body, mesh = lj.Body(density=1060.0), lj.shapes.box((0.036, 0.012, 0.012), (3, 1, 1))
+    law = lj.laws.NeoHookean(mu=mu, bulk=10 * mu)
+    solve = lj.Solve(kind="harmonic", frequencies=jnp.asarray(hertz))
+    found = [s for s in cautions_of_waves(lj.Scene(mesh=mesh, law=law, body=body, solve=solve, **change)) if "Hz" in s]
+    assert len(found) == bool(said) and all(s.startswith(said) for s in found)
+
+
 SCENE = """
 [mesh]
 shape = "box"

@@ -255,3 +255,12 @@ def test_derivatives_of_mixed_elements_about_a_state():
     about = scene.mesh.points * jnp.array([[1.0, 1.0, 1.1]])
     at = {"law.mu": jnp.full(scene.mesh.number_of_elements, MU), "law.bulk": jnp.asarray(10 * MU)}
     check_derivatives(scene, at | {"body.density": jnp.asarray(1e3)}, FREQUENCIES, about)
+
+
+def test_the_mesh_s_error_of_a_sponge_takes_factors_of_elements():
+    """The refined mesh has eight times as many elements, and the factors of the scene were refused for it."""
+    scene = replace(column(1, 1, 1.0), body=lj.Body(density=1000.0))
+    factors = jnp.full((1, scene.mesh.number_of_elements), 0.8 + 0.1j)
+    found = lj.harmonic(scene, [5.0], factors)
+    own, same = (lj.harmonic_errors(scene, found, f).displacement for f in (factors, factors[:, 0]))
+    assert np.abs(own - same).max() < 1e-9 * np.abs(same).max()

@@ -6,6 +6,7 @@ import pytest
 from test_porosity import column
 
 import liverjax as lj
+from liverjax.__main__ import main
 from liverjax.core.struct import replace
 from liverjax.jobs import waves
 from liverjax.physics.porosity import Inlet
@@ -110,3 +111,18 @@ def test_a_region_that_relaxes_slowly_counts_in_a_loaded_shape():
         scene = scene_from(table | more)
         said = cautions_of_loaded(scene, jnp.asarray(0.05 * np.arange(1, 11)))
         assert bool(said) == told and (not told or "relaxation time is 20 s" in said[0])
+
+
+def test_a_run_whose_tractions_act_at_held_nodes_has_rested(tmp_path):
+    """The body is elastic. Where a traction acts at a held node, the reaction was taken for unrelaxed stress."""
+    (tmp_path / "push.toml").write_text("""mesh = {shape = "box", size = [0.02, 0.02, 0.02], cells = [2, 2, 2]}
+law = {name = "neo_hookean", mu = 3000.0, bulk = 9000.0}
+body = {density = 1000.0}
+fixed = [{where = {z_max = 0.0}}]
+traction = [{where = {x_min = 0.02}, value = [100.0, 0.0, 0.0]}]
+""")
+    assert main(["simulate", str(tmp_path / "push.toml"), "--out", str(tmp_path)]) == 0
+    scene = lj.load_scene(tmp_path / "push.toml")
+    x, reactions = waves._last_state(tmp_path / "result.h5", scene)
+    assert waves._of_rest(scene, x, reactions, "--about run") == []
+    assert waves._of_rest(scene, x, 0.9 * reactions, "--about run")

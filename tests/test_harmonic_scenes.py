@@ -13,6 +13,7 @@ from test_harmonic import FILE, slab
 import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.core.struct import replace
+from liverjax.waves.harmonic import largest_in_period
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -151,3 +152,26 @@ def test_runs_in_time_refuse_a_harmonic_scene():
         lj.simulate(replace(scene, solve=lj.Solve(kind="harmonic", frequencies=jnp.array([60.0]))))
     with pytest.raises(lj.InputError, match="needs frequencies_Hz"):
         lj.harmonic(scene)
+
+
+def test_the_largest_displacement_is_one_that_a_node_reaches():
+    """On a circle the displacement always has the size of the radius. The norm of the amplitude is sqrt(2) times it."""
+    rng = np.random.default_rng(0)
+    u = np.concatenate([rng.normal(size=(4, 3)) + 1j * rng.normal(size=(4, 3)), [[2.0, 2.0j, 0.0], [3.0j, 4.0j, 0.0]]])
+    turn = np.exp(1j * np.linspace(0, 2 * np.pi, 2001))[:, None, None]
+    reached = np.linalg.norm((turn * u).real, axis=2).max(axis=0)
+    np.testing.assert_allclose(largest_in_period(u), reached, rtol=1e-5)
+    np.testing.assert_allclose(reached[-2:], [2.0, 5.0], rtol=1e-5)
+
+
+def test_a_motion_without_an_amplitude_is_refused():
+    """It ended in a traceback of JAX."""
+    scene = slab(2, 1)
+    times = jnp.array([0.0, 1.0])
+    way = {"times": times, "history": jnp.array([[0.0, 0.0, 0.0], [1e-4, 0.0, 0.0]])}
+    moved = replace(scene, displaced=(replace(scene.displaced[0], by=None, **way), *scene.displaced[1:]))
+    with pytest.raises(lj.InputError, match=r"displaced\.0 has a history but no amplitude: give by, or the argument"):
+        lj.harmonic(moved, [10.0])
+    given = jnp.zeros(scene.mesh.points.shape).at[scene.displaced[0].nodes, 0].set(1e-4)
+    found, expected = (lj.harmonic(own, [10.0], motion=given).displacement for own in (moved, scene))
+    assert np.array_equal(found, expected)

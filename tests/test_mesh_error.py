@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 
 import liverjax as lj
+from liverjax.__main__ import main
 from liverjax.core.struct import replace
+from liverjax.jobs import long_run
 from liverjax.physics.attached.ligament import Ligament
 from liverjax.physics.elastic_support import ElasticSupport
+from liverjax.simulation import mesh_error
 from liverjax.simulation.cautions import mesh_sentence
 
 pytestmark = pytest.mark.quick_to_compile
@@ -183,3 +186,27 @@ def test_forces_at_single_nodes_are_named_beside_the_mesh_error():
     for physics, said in ((cable, "[[ligament]] at single nodes"), (springs, "[[support]] at single nodes")):
         assert said in mesh_sentence(replace(scene, physics=(physics,)), result)
     assert "single nodes" not in mesh_sentence(scene, result)
+
+
+def test_the_command_refuses_before_the_run_and_never_loses_the_result(tmp_path, monkeypatch, capsys):
+    """The mesh error was refused after the last step, and nothing was written."""
+    text = """mesh = {shape = "box", size = [0.02, 0.02, 0.02], cells = [1, 1, 1]}
+law = {name = "neo_hookean", mu = 770.0, bulk = 2200.0}
+fixed = [{where = {z_max = 0.0}}]
+displaced = [{where = {z_min = 0.02}, by = [0.0, 0.0, 0.001]}]
+"""
+    file, out = tmp_path / "scene.toml", tmp_path / "out"
+    ask = ["simulate", str(file), "--mesh-error", "--out", str(out)]
+    for line in ('newton = "one_step"', "newton_iterations = 1"):
+        file.write_text(f"{text}[solve]\n{line}\n")
+        with monkeypatch.context() as changed:
+            changed.setattr(long_run, "run", lambda *_: pytest.fail("the scene must not run"))
+            assert main(ask) == 2 and "has an additional error" in capsys.readouterr().err
+
+    def refused(scene):
+        raise lj.InputError("this mesh error is not known: use another scene")
+
+    file.write_text(text)
+    monkeypatch.setattr(mesh_error, "richer", refused)
+    assert main(ask) == 0 and "caution: this mesh error is not known" in capsys.readouterr().out
+    assert (out / "result.h5").exists()

@@ -269,6 +269,19 @@ def test_an_obstacle_that_comes_later_changes_nothing():
     assert np.allclose(touched.scene.mesh.points, free.scene.mesh.points, atol=1e-14)
 
 
+def test_the_command_refuses_a_reduced_model_of_a_loaded_shape(tmp_path, capsys):
+    """The message said that reduced models are only for the command that was used."""
+    text = """mesh = {shape = "box", size = [0.02, 0.02, 0.02], cells = [1, 1, 1], is = "loaded"}
+law = {name = "neo_hookean", mu = 770.0, bulk = 2200.0}
+fixed = [{where = {z_max = 0.0}}]
+solve = {reduced = "model.h5"}
+"""
+    (tmp_path / "scene.toml").write_text(text)
+    assert main(["simulate", str(tmp_path / "scene.toml"), "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert '[mesh] is = "loaded" cannot be used with reduced models' in said and said.count("\n") == 1
+
+
 def test_what_cannot_be_is_said():
     with pytest.raises(InputError, match="is = 'slack' is not known"):
         scene_from(content(mesh=content()["mesh"] | {"is": "slack"}))

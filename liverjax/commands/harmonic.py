@@ -48,8 +48,9 @@ def _refuse_options(options: argparse.Namespace) -> None:
 
 def _tell(scene: "Scene", ran: "Waves") -> None:
     from liverjax.jobs.waves import missing_parts
+    from liverjax.waves.harmonic import largest_in_period
 
-    u = np.linalg.norm(np.asarray(ran.found.displacement), axis=-1)
+    u = largest_in_period(np.asarray(ran.found.displacement))
     parts = None if ran.mesh_error is None else missing_parts(scene, ran)
     print(
         f"{scene.mesh.number_of_nodes} nodes, {scene.mesh.number_of_elements} tetrahedra, {len(u)} frequencies in "

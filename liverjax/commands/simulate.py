@@ -13,7 +13,6 @@ from liverjax.core.files import writable
 if TYPE_CHECKING:
     from liverjax.jobs.long_run import Ran
     from liverjax.scenes.scene import Scene
-    from liverjax.simulation.run import Result
 
 #: Default of --every.
 _EVERY = 50
@@ -62,8 +61,7 @@ def run(options: argparse.Namespace) -> int:
     names, reactions = _asked_for(options, scene, text)
     if scene.solve.kind == "harmonic":
         return harmonic.run(options, scene, text)
-    if options.about:
-        raise InputError("--about can be used only with [solve] kind = 'harmonic': remove --about")
+    _check_before_steps(options, scene)
     given = scene.points_are
     if given == "loaded":
         scene = unloaded(scene).scene
@@ -85,10 +83,9 @@ def run(options: argparse.Namespace) -> int:
         return 1
     finally:
         bar.close()
-    if options.mesh_error:
-        ran = ran._replace(result=_with_mesh_error(scene, ran.result))
+    ran, unknown = _with_mesh_error(scene, ran) if options.mesh_error else (ran, [])
     found = fields.fields(scene, ran.result, names) if names else {}
-    said = cautions_of_run(replace(scene, points_are=given), ran.result)
+    said = [*cautions_of_run(replace(scene, points_are=given), ran.result), *unknown]
     _write_and_tell((scene, text, said), ran, target, found)
     if in_parts and resumable_parts.beside(target).exists():
         resumable_parts.remove(resumable_parts.beside(target))
@@ -123,6 +120,21 @@ def _asked_for(options: argparse.Namespace, scene: "Scene", text: str) -> tuple[
     return names, reactions or options.reactions
 
 
+def _check_before_steps(options: argparse.Namespace, scene: "Scene") -> None:
+    """Raise `InputError` if a static or dynamic scene and the options cannot be used together."""
+    from liverjax.simulation import automatic
+    from liverjax.simulation.mesh_error import refuse
+
+    if options.about:
+        raise InputError("--about can be used only with [solve] kind = 'harmonic': remove --about")
+    if scene.solve.reduced and scene.points_are == "loaded":
+        from liverjax.reduced.model import refuse_unknown_physics
+
+        refuse_unknown_physics(scene)
+    if options.mesh_error:
+        refuse(automatic.chosen(scene))
+
+
 def _reduced(scene: "Scene") -> tuple["Ran | None", "Scene"]:
     """Return (run, scene): the run with the reduced model, or None if the full model has to run; and the scene without
     the reduced model."""
@@ -140,15 +152,20 @@ def _steps_per_part(options: argparse.Namespace) -> int:
     return _EVERY if options.every is None else options.every
 
 
-def _with_mesh_error(scene: "Scene", result: "Result") -> "Result":
+def _with_mesh_error(scene: "Scene", ran: "Ran") -> tuple["Ran", list[str]]:
+    """Return the run with its estimated mesh error. If this error cannot be estimated, also return the reason."""
     from liverjax.core.compiled import compiled
     from liverjax.core.struct import replace
     from liverjax.simulation.mesh_error import estimated_error, richer
     from liverjax.simulation.run import prepared
 
-    scene = prepared(scene)
-    arguments = (scene, richer(scene), result.positions, result.reactions, result.pressure)
-    return replace(result, mesh_error=compiled(estimated_error, *arguments)(*arguments))
+    scene, result = prepared(scene), ran.result
+    try:
+        arguments = (scene, richer(scene), result.positions, result.reactions, result.pressure)
+        error = compiled(estimated_error, *arguments)(*arguments)
+    except InputError as e:  # the run is finished, so its result is written all the same
+        return ran, [str(e)]
+    return ran._replace(result=replace(result, mesh_error=error)), []
 
 
 def _sizes_of_places(scene: "Scene") -> list[str]:

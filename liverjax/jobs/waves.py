@@ -2,6 +2,7 @@
 
 import json
 import time
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -21,11 +22,12 @@ from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene import Scene, Solve
+from liverjax.scenes.scene_file import nodes_under_traction
 from liverjax.simulation.equations import forces_at
 from liverjax.simulation.run import prepared
 from liverjax.simulation.unloaded import resting
 from liverjax.waves.cautions import cautions_of_waves
-from liverjax.waves.harmonic import Harmonic, harmonic
+from liverjax.waves.harmonic import Harmonic, harmonic, largest_in_period
 from liverjax.waves.mesh_error import HarmonicError, harmonic_errors
 from liverjax.waves.rest import under_its_weight
 
@@ -71,13 +73,17 @@ def solved_waves(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
 
 
 def _last_state(file: Path, scene: Scene) -> tuple[jax.Array, np.ndarray]:
-    """Read positions [m] and reactions [N] (V, 3) of the last step in the file."""
+    """Read positions [m] and reactions [N] (V, 3) of the last step in the file.
+
+    A reaction also balances the load at its node. So the reactions are set to 0 where a traction of the run acts.
+    """
     import h5py
 
     try:
         with h5py.File(file) as given:
             x, reactions = (np.asarray(given[name][-1]) for name in ("positions", "reactions"))
             code = int(np.ravel(read_by_step(given, "status"))[-1])
+            text = str(given.attrs.get("scene", ""))
     except FileNotFoundError:
         raise InputError(f"--about {file} does not exist: give the result.h5 of a run of this scene") from None
     except (OSError, KeyError, IndexError) as error:
@@ -91,13 +97,23 @@ def _last_state(file: Path, scene: Scene) -> tuple[jax.Array, np.ndarray]:
         raise InputError(
             f"--about {file}: the last step of this run is {status.NAMES[code]}; give a run that ended in equilibrium"
         )
+    reactions[_nodes_under_traction_of(text, scene)] = 0.0
     return jnp.asarray(x), reactions
+
+
+def _nodes_under_traction_of(text: str, scene: Scene) -> np.ndarray:
+    """Return the nodes under a traction in the scene file `text` of a run of the same mesh; none if it is not known."""
+    try:
+        return nodes_under_traction(tomllib.loads(text.lstrip("\ufeff")), scene.mesh)
+    except (tomllib.TOMLDecodeError, InputError):
+        return np.zeros(0, int)
 
 
 def _of_rest(scene: Scene, x: jax.Array, reactions: np.ndarray, name: str) -> list[str]:
     """Return a warning if the reactions (V, 3) [N] of a run differ from those of the relaxed body at the positions x.
 
-    If so, the stress of the run also differs from the relaxed stress. There is no warning for a porous body.
+    Nodes without a reaction are not compared. If the reactions differ, the stress of the run also differs from the
+    relaxed stress. There is no warning for a porous body.
     """
     pulled = np.linalg.norm(reactions, axis=1)
     if scene.porosity is not None or not pulled.any():
@@ -122,8 +138,8 @@ def missing_parts(scene: Scene, waves: Waves) -> tuple[np.ndarray, np.ndarray]:
     """Return the relative mesh errors of motion (F,) and of support forces (F,) at F frequencies.
 
     The norm of the error is divided by the norm of the motion. The largest error of a support force is divided by the
-    largest support force. The errors are NaN at frequencies without motion or without force. The mesh error must have
-    been estimated before.
+    largest support force; both are the largest values during a period. The errors are NaN at frequencies without motion
+    or without force. The mesh error must have been estimated before.
     """
     error, found = waves.mesh_error, waves.found
     if error is None:
@@ -132,7 +148,7 @@ def missing_parts(scene: Scene, waves: Waves) -> tuple[np.ndarray, np.ndarray]:
     more, force = (held_forces(scene, np.asarray(own)) for own in (error.reactions, found.reactions))
 
     def largest(forces: dict[str, np.ndarray]) -> np.ndarray:
-        return np.max([np.linalg.norm(own, axis=1) for own in forces.values()], axis=0, initial=0.0)
+        return np.max([largest_in_period(own) for own in forces.values()], axis=0, initial=0.0)
 
     sizes += [largest(more) if more else 0 * sizes[0], largest(force) if force else 0 * sizes[0]]
     with np.errstate(invalid="ignore", divide="ignore"):

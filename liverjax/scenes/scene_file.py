@@ -20,6 +20,7 @@ from liverjax.mesh import shapes
 from liverjax.mesh.adjacency import node_numbers
 from liverjax.mesh.files import read_mesh
 from liverjax.mesh.promotion import quadratic
+from liverjax.mesh.surface import triangle_nodes
 from liverjax.mesh.tetrahedra import UNITS, TetMesh
 from liverjax.physics import boundary
 from liverjax.physics.base import Physics
@@ -121,6 +122,24 @@ def scene_from(content: Content, folder: Path = Path()) -> Scene:
     refuse_idle(content)
     check_scene(scene)
     return scene
+
+
+def nodes_under_traction(content: Content, mesh: TetMesh) -> np.ndarray:
+    """Return the numbers of the nodes of all triangles on which a [[traction]] of a scene file acts.
+
+    Args:
+        content: content of the scene file.
+        mesh: the mesh of the scene.
+
+    Raises:
+        InputError: an entry selects no triangles of this mesh.
+    """
+    found = [np.zeros(0, int)]
+    for k, table in enumerate(_tables(content, "traction")):
+        place = {key: value for key, value in table.items() if key in PLACE}
+        load = _traction(mesh, k, place | {"value": [0.0, 0.0, 0.0]})  # the values have no effect on the selection
+        found += [np.asarray(nodes) for nodes in triangle_nodes(mesh, load.triangles)]
+    return np.unique(np.concatenate(found))
 
 
 def output_of(content: Mapping[str, object]) -> tuple[list[str], bool]:

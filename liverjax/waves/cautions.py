@@ -1,6 +1,7 @@
 """Warnings about a scene with harmonic motion. They are computed from known numbers, outside jit, grad and vmap."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.errors import InputError
@@ -9,6 +10,7 @@ from liverjax.physics.contact.obstacle import Obstacle, touches_without_pressure
 from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene import Scene, named_physics
 from liverjax.simulation.cautions import cautions_of_mesh, of_drained_layer, of_locking
+from liverjax.waves.harmonic import relative_moduli
 
 #: Minimum number of element edges per wavelength of a shear wave. With fewer edges, even quadratic elements cannot
 #: describe a wave.
@@ -44,33 +46,38 @@ def cautions_of_waves(scene: Scene, about: jax.Array | None = None) -> list[str]
     if scene.solve.frequencies is None:
         return said
     hertz = float(np.max(np.asarray(scene.solve.frequencies)))
-    said += _of_short_waves(scene, hertz)
+    said += _of_short_waves(scene, np.asarray(scene.solve.frequencies))
     if scene.porosity is not None:
         said += of_drained_layer(scene, 1 / (2 * np.pi * hertz), f"at {hertz:.3g} Hz, within 1/omega = {{:.2g}} s,")
     return said
 
 
-def _of_short_waves(scene: Scene, hertz: float) -> list[str]:
-    """Return a warning if the shear waves of the elastic body at this frequency [Hz] are too short for the elements.
+def _of_short_waves(scene: Scene, hertz: np.ndarray) -> list[str]:
+    """Return a warning if the shear waves at one of the frequencies (F,) [Hz] are too short for the elements.
 
-    The sizes in the warning are those of the part of the body with the lowest shear modulus.
+    The sizes in the warning are those of the shortest waves, and of the part of the body with these waves.
     """
     if scene.body is None:
         return []
+    own = by_element(scene)
     try:
-        moduli = np.asarray(by_element(scene).law.shear_modulus(), float)
+        moduli = np.asarray(own.law.shear_modulus(), float)
     except InputError:  # a law may have no moduli
         return []
     # The lowest modulus of each element, if it has several points.
     moduli = np.broadcast_to(np.atleast_2d(moduli).min(axis=0), scene.mesh.number_of_elements)
     corners = np.asarray(scene.mesh.points)[np.asarray(scene.mesh.tetrahedra)]
     edges = np.linalg.norm(corners[:, [0, 0, 0, 1, 1, 2]] - corners[:, [1, 2, 3, 2, 3, 3]], axis=2)
-    softest = moduli <= moduli.min() * (1 + 1e-9)
-    edge, shear = float(np.median(edges[softest])), float(moduli.min())
-    length = float(np.sqrt(shear / np.median(np.asarray(scene.body.density)))) / hertz
+    factors = np.asarray(relative_moduli(own, 2 * np.pi * jnp.asarray(hertz))).reshape(len(hertz), -1)
+    # The wave number of a shear wave is omega / speed. Its real part is 2 pi / wavelength.
+    speeds = np.sqrt(factors * moduli / np.median(np.asarray(scene.body.density)))
+    lengths = np.abs(speeds) ** 2 / np.maximum(speeds.real, np.finfo(float).tiny) / hertz[:, None]
+    shortest = lengths.min(axis=0)
+    length, at = float(shortest.min()), float(hertz[lengths.min(axis=1).argmin()])
+    edge = float(np.median(edges[shortest <= length * (1 + 1e-9)]))
     if length >= _LEAST_PER_WAVE * edge:
         return []
     return [
-        f"at {hertz:.3g} Hz shear waves are about {length:.2g} m long, and the edges of the elements are {edge:.2g} m "
+        f"at {at:.3g} Hz shear waves are about {length:.2g} m long, and the edges of the elements are {edge:.2g} m "
         "long. The mesh is too coarse for these waves: use a finer mesh, or lower frequencies (see --mesh-error)"
     ]

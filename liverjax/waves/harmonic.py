@@ -62,6 +62,15 @@ class Harmonic:
         return self
 
 
+def largest_in_period(amplitudes: np.ndarray) -> np.ndarray:
+    """Return the largest norms (…) during a period of vectors with the complex amplitudes (…, 3).
+
+    If the components have different phases, they do not reach their largest values at the same time.
+    """
+    squares = np.sum(np.abs(amplitudes) ** 2, axis=-1) + np.abs(np.sum(amplitudes**2, axis=-1))
+    return np.sqrt(squares / 2)
+
+
 def harmonic(
     scene: Scene,
     frequencies_Hz: Numbers | None = None,
@@ -102,19 +111,17 @@ def harmonic(
     weighed = scene
     omegas = 2 * jnp.pi * _frequencies(scene.solve.frequencies if frequencies_Hz is None else frequencies_Hz)
     if scene.springpots is not None:
-        factors = springpot_factors(scene.springpots, omegas) if factors is None else factors
+        factors = relative_moduli(scene, omegas) if factors is None else factors
     scene = _small(scene, mass)
     about = under_its_weight(weighed) if about is None else about
     mesh = scene.mesh
     number, elements = len(omegas), mesh.number_of_elements
-    factors = _factors(scene, omegas) if factors is None else jnp.asarray(factors, complex)
+    factors = relative_moduli(scene, omegas) if factors is None else jnp.asarray(factors, complex)
     if factors.shape not in ((number,), (number, elements)):
         raise InputError(
             f"the argument 'factors' has shape {factors.shape}: give ({number},) or ({number}, {elements})"
         )
-    if motion is None:
-        motion = prescribed(mesh, tuple(replace(d, times=None, history=None) for d in scene.displaced), 0.0, 1.0)
-    motion = jnp.asarray(motion, complex)
+    motion = jnp.asarray(_amplitudes_of_motion(scene) if motion is None else motion, complex)
     if motion.shape not in (mesh.points.shape, (number, *mesh.points.shape)):
         raise InputError(
             f"the argument 'motion' has shape {motion.shape}: give {mesh.points.shape}, or one such array per frequency"
@@ -122,6 +129,14 @@ def harmonic(
     _check_about(scene, about)
     motion = jnp.broadcast_to(motion, (number, *mesh.points.shape))
     return _answer(scene, (factors, omegas), motion, about, mass)
+
+
+def _amplitudes_of_motion(scene: Scene) -> jax.Array:
+    """Return the amplitudes (V, 3) [m] of the prescribed motions. Raise InputError if one has only a history."""
+    for k, moved in enumerate(scene.displaced):
+        if moved.by is None:
+            raise InputError(f"displaced.{k} has a history but no amplitude: give by, or the argument 'motion'")
+    return prescribed(scene.mesh, tuple(replace(d, times=None, history=None) for d in scene.displaced), 0.0, 1.0)
 
 
 def _check_about(scene: Scene, about: jax.Array | None) -> None:
@@ -152,7 +167,7 @@ def element_operator(scene: Scene, about: jax.Array | None = None, mass: str = "
 
 def _operator(scene: Scene, about: jax.Array | None, mass: str) -> Operator:
     solve = replace(scene.solve, volumetric="element")
-    unmoved = tuple(replace(d, by=jnp.zeros(3)) for d in scene.displaced)
+    unmoved = tuple(replace(d, by=jnp.zeros(3), times=None, history=None) for d in scene.displaced)
     still = replace(scene, viscosity=None, porosity=None, displaced=unmoved, solve=solve)
     none = jnp.zeros(())
     e = equations(still, initial_state(still), 1.0, Sizes(none, none))
@@ -221,8 +236,15 @@ def _frequencies(frequencies_Hz: Any) -> jax.Array:
     return found
 
 
-def _factors(scene: Scene, omegas: jax.Array) -> jax.Array:
-    """Return the complex factors G*/G0 of viscosity at F frequencies: (F,), or (F, E) with one value per element."""
+def relative_moduli(scene: Scene, omegas: jax.Array) -> jax.Array:
+    """Return the complex factors G*/G0 of springpots or viscosity: (F,), or (F, E) with one value per element.
+
+    Args:
+        scene: a scene without regions (`by_element`).
+        omegas: F angular frequencies [rad/s].
+    """
+    if scene.springpots is not None:
+        return springpot_factors(scene.springpots, omegas)
     prony = scene.viscosity
     if prony is None:
         return jnp.ones(omegas.shape, complex)

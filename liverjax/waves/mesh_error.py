@@ -78,6 +78,8 @@ def harmonic_errors(
     of_all_nodes = partial(_padded, rich.mesh, within)
     motion = None if motion is None else of_all_nodes(jnp.asarray(motion, complex))
     about = None if about is None else of_all_nodes(jnp.asarray(about))
+    if within is not None and factors is not None and jnp.ndim(factors) == 2:
+        factors = jnp.repeat(jnp.asarray(factors), 8, axis=1)  # for the eight parts of every element
     try:
         more = harmonic(rich, found.frequencies_Hz, factors, about, motion)
     except InputError as e:

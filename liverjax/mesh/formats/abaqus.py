@@ -76,9 +76,9 @@ def read_abaqus(path: Path) -> "meshio.Mesh":
         name: [*(_indices_of(block.labels, own) for block in blocks.values()), *none]
         for name, own in element_sets.items()
     }
-    empty = [np.zeros(0, int)] * len(blocks)
     for k, (name, triangles) in enumerate(surfaces.items()):
-        cell_sets[name] = [*empty, *none[:k], np.arange(len(triangles)), *none[k + 1 :]]
+        own = cell_sets.setdefault(name, [np.zeros(0, int)] * (len(blocks) + len(surfaces)))
+        own[len(blocks) + k] = np.arange(len(triangles))  # a set of elements with the same name keeps its elements
     return meshio.Mesh(
         points,
         [*((block.kind, block.nodes) for block in blocks.values()), *(("triangle", own) for own in surfaces.values())],
