@@ -208,3 +208,25 @@ def test_a_factor_of_a_test_is_no_misfit_of_the_law():
     assert any(w.startswith(stress_stretch.OWN_FACTORS) for w in found.warnings)
     assert not structured_curves(several, found)
     assert structured_curves(several, found._replace(warnings=[]))
+
+
+def test_curves_of_one_sample_need_not_be_neighbours():
+    """The curves of four samples were ordered by their component. They counted as eight samples, and the error of the
+    modulus was half as large."""
+    rng, stretch = np.random.default_rng(0), np.linspace(1.05, 1.4, 12)
+    law = lj.laws.NeoHookean(mu=1000.0, bulk=None)
+    (candidate,) = stress_stretch.candidates("neo_hookean")
+    F = np.eye(3) * np.stack([stretch, stretch**0.2, stretch**-1.2], axis=1)[:, :, None]
+    P = np.asarray(homogeneous.nominal_stress(law, F))
+    by_sample = []
+    for k, factor in enumerate((0.8, 0.95, 1.1, 1.2)):
+        for i in (0, 1):
+            noisy = factor * P[:, i, i] * (1 + 0.005 * rng.standard_normal(12))
+            by_sample.append(curves.Curve(f"{k}, {i}", "general", F, (i, i), noisy, sample=f"{k}"))
+    by_component = by_sample[::2] + by_sample[1::2]
+    errors = []
+    for each in (by_sample, by_component):
+        found = stress_stretch.fit(candidate, each, starts=2)
+        errors.append(found.standard_errors[0])
+        assert any("(estimated from 4 tests)" in told for told in found.warnings)
+    assert errors[1] == pytest.approx(errors[0], rel=1e-6)

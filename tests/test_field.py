@@ -240,6 +240,43 @@ def test_a_map_that_was_killed_ends_where_an_unbroken_one_ends(problem, monkeypa
     assert finished.history == again.history
 
 
+def test_a_stopped_map_goes_on_with_more_iterations(problem, monkeypatch, tmp_path):
+    """The search stopped at its limit of iterations. A larger limit was then the reason to count it as finished."""
+    _of_a_formula(monkeypatch, problem)
+    file, how = tmp_path / "p.h5", {"length": 0.02, "modes": 30, "mesh_error": False}
+    for older in (False, True):
+        few = field.estimate(problem, file=file, max_iterations=2, **how)
+        assert field.distance_sentence(few) is not None
+        with h5py.File(file, "a") as f:
+            rows = f["history"][:]
+            if older:  # older versions did not write whether the search converged
+                del f["history"]
+                f["history"] = rows[:, :5]
+        more = field.estimate(problem, file=file, resume=True, max_iterations=50, **how)
+        assert more.distance < 0.05 and field.distance_sentence(more) is None
+        assert more.history[-1]["converged"] == 1
+
+
+def test_a_prior_that_is_narrow_does_not_hide_an_open_level(problem, monkeypatch):
+    """The residuals depend only on differences of m, and the true level is twice that of the scene. The first prior
+    fitted the data, so no standard deviation was above 0.5, and there was no warning."""
+    n = problem.scenes[0].mesh.number_of_nodes
+    A = np.random.default_rng(0).normal(size=(n, n))
+
+    def told(A):
+        @partial(jax.jit, static_argnames="name")
+        def linearised(problem, base, m, name):
+            return jax.linearize(lambda m: (jnp.asarray(A) @ m, (jnp.zeros((), jnp.int32),)), m, has_aux=True)
+
+        monkeypatch.setattr(field, "_linearised", linearised)
+        found = field.estimate(problem, length=0.02, modes=10, mesh_error=False)
+        assert found.deviation == field.DEVIATIONS[0] and found.sd.max() < field.OPEN
+        return field.level_sentence(found)
+
+    assert "only the prior ties the mean modulus" in told(A - A.mean(axis=1, keepdims=True))
+    assert told(A) is None
+
+
 def test_a_search_goes_back_from_where_there_is_no_answer(problem, monkeypatch):
     """Failed runs once had a fixed cost. If it was below chi^2, the search ended at a failed run."""
     _of_a_formula(monkeypatch, problem)
@@ -296,7 +333,7 @@ def test_a_map_is_written_at_the_nodes_of_its_mesh(tmp_path, order):
     m = prior.field_at_nodes(p, rng.normal(size=mesh.number_of_vertices))
     none, E = np.zeros_like(m), mesh.number_of_elements
     nowhere, rest = np.zeros(E, bool), (0.1, 0.02, 1.0, 9, True, 0.0, [], np.ones(3), (0,), 1.0)
-    found = field.Field("law.mu", m, np.ones(E), none + 0.1, none + 1, none, none, *rest, nowhere)
+    found = field.Field("law.mu", m, np.ones(E), none + 0.1, none + 1, none, none, *rest, nowhere, 0.1)
     field_report.write(tmp_path, mesh, {}, found)
     with h5py.File(tmp_path / "field.h5") as f:
         factor = f["factor"][:]
@@ -325,7 +362,7 @@ def test_a_sphere_starts_where_the_map_is_known(problem):
     m = np.where(near, 1.0, np.where(corner, -2.0, 0.0))
     sd = np.where(corner, 3.0, 0.1)
     rest = (1.6, 0.02, 1.0, 9, True, 0.0, [], np.ones(3), (0,), 1.0)
-    found = field.Field("law.mu", m, m, sd, sd, None, None, *rest, m > 9)
+    found = field.Field("law.mu", m, m, sd, sd, None, None, *rest, m > 9, 0.1)
     start = inclusion.start_from(problem, found)
     assert np.linalg.norm(start[:3] - [0.03, 0.02, 0.02]) < 0.01 and start[5] > 0
 

@@ -50,7 +50,7 @@ def test_a_fit_that_misses_the_data_says_so():
     ],
 )
 def test_a_map_whose_level_is_open_says_so_and_the_mesh_is_blamed_for_its_own_share(sd, bias, level, mesh):
-    found = SimpleNamespace(sd=np.array(sd), mesh_bias=np.array(bias), time_step_bias=None)
+    found = SimpleNamespace(sd=np.array(sd), mesh_bias=np.array(bias), time_step_bias=None, level_sd=0.1)
     assert (field.level_sentence(found) is not None) == level
     said = field.map_bias_sentences(found)
     assert said == [] if mesh is None else len(said) == 1 and mesh in said[0]

@@ -6,7 +6,7 @@ import pytest
 
 import liverjax as lj
 from fitting.amplitude import cycle
-from fitting.fits import joint, scene_numbers, stress_stretch, time_tests, together
+from fitting.fits import joint, samples, scene_numbers, stress_stretch, time_tests, together
 from fitting.fits.families import hyperelastic
 from fitting.fits.scene_numbers import Problem
 from fitting.methods.generalised_maxwell import Maxwell, moduli
@@ -22,6 +22,7 @@ LAW = lj.laws.NeoHookean(mu=1000.0, bulk=5000.0)
 OMEGA = np.geomspace(0.1, 100, 8)
 MODEL = Maxwell(1000.0, np.array([0.3, 0.2]), np.array([1.0, 0.05]))
 SWEEP = Sweep(OMEGA, *map(np.asarray, moduli(MODEL, jnp.asarray(OMEGA))))
+ONE = Sweep(OMEGA[:1], SWEEP.storage[:1], SWEEP.loss[:1])
 RIG = torsion.make_rig(cell_size=0.004)
 PRESSED = replace(RIG, held=RIG.mesh.points)
 TIME = np.geomspace(0.01, 10, 12)
@@ -68,6 +69,7 @@ WRONG = {
     "ascending order": lambda: together.fit([Sweep(OMEGA[::-1], SWEEP.storage, SWEEP.loss), TEST], 1),
     "modes = 1.9 must be a whole number": lambda: together.fit([SWEEP, TEST], 1.9),
     "modes = 2.9 must be a whole number": lambda: time_tests.fit(TEST, 2.9),
+    "one frequency does not determine a mode": lambda: samples.fit([ONE, ONE]),
     "the times do not ascend": lambda: of_columns("creep", TIME[::-1], np.ones(12), TIME, ("file", [])),
     "det F = 1.3 at point 8": lambda: neo_hookean(ELONGATED),
     "F or stress is not finite": lambda: neo_hookean(PLAIN * np.where(STRETCH > 1.2, np.nan, 1.0)[:, None, None]),

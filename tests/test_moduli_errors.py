@@ -13,6 +13,7 @@ from fitting.methods import generalised_maxwell
 from fitting.methods.estimate import wider
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.frequency_sweep import Sweep
+from fitting.rigs import compression
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -71,6 +72,55 @@ def test_the_choice_of_the_model_is_among_them(chosen):
     by_hand = np.exp(-0.5 * (aicc - aicc.min()))
     by_hand = dict(zip(alone, by_hand / by_hand.sum(), strict=True))
     assert all(weights[name] == pytest.approx(by_hand[name], abs=1e-3) for name in weights)
+
+
+def repeated(seed: int) -> Sweep:
+    """Four repeats at each of 12 frequencies. The error of 5 % is common to the repeats; 0.3 % is independent."""
+    rng, omega = np.random.default_rng(seed), np.repeat(OMEGA[::3][:10], 4)
+    halves = np.stack(generalised_maxwell.moduli(MODE, omega))
+    common = np.repeat(1 + 0.05 * rng.standard_normal((2, 10)), 4, axis=1)
+    return Sweep(omega, *(halves * common * (1 + 0.003 * rng.standard_normal((2, 40)))))
+
+
+def uneven(seed: int) -> Sweep:
+    """The noise of G' is 0.2 %, and that of G'' is 5 %."""
+    halves = np.stack(generalised_maxwell.moduli(MODE, OMEGA))
+    size = np.array([0.002, 0.05])[:, None]
+    return Sweep(OMEGA, *(halves * (1 + size * np.random.default_rng(seed).standard_normal((2, 31)))))
+
+
+@pytest.mark.parametrize("made", [repeated, uneven])
+def test_noise_that_the_residuals_show_is_in_them(made):
+    """Only the errors of the parameters contained this noise. The errors of the moduli were half as large as their
+    scatter, or twice as large."""
+    found = []
+    for k in range(30):
+        s = made(k)
+        found.append(moduli_errors.fitted_moduli(viscoelastic.closed_form(s, 1), OMEGA[::10], s.noise_given))
+    scatter = np.std([f.values for f in found], axis=0, ddof=1)
+    ratio = scatter / np.median([f.standard_errors for f in found], axis=0)
+    # A deviation from 30 draws has an error of 1 / sqrt(58) = 13 %. The errors contain Student's t of 10 series.
+    assert np.all((ratio > 0.6) & (ratio < 1.5)), ratio
+
+
+def test_factors_of_a_compressed_sample_that_change_nothing_keep_the_errors():
+    """The errors for independent noise replaced the errors for the noise that the residuals show."""
+    s = repeated(0)
+    fit = viscoelastic.closed_form(s, 1)
+    same = instrument.of_compressed_sample(fit, s, compression.Shares(1.0, 1.0))
+    np.testing.assert_allclose(same.uncertainty.standard_errors, fit.uncertainty.standard_errors, rtol=1e-6)
+
+
+def test_the_ratio_of_a_compressed_fluid_with_one_mode_is_exactly_one():
+    """Its error became infinite, and a warning advised to measure more."""
+    model = Maxwell(np.float64(700.0), np.array([1.0]), np.array([0.3]))
+    storage, loss = generalised_maxwell.moduli(model, OMEGA)
+    s = measured(storage + 1j * loss, 1)
+    fit = viscoelastic.modes_from(s, np.log([[700.0, 0.3]]), viscoelastic.FLUID)
+    at_rest = instrument.of_compressed_sample(fit, s, compression.Shares(1.1, 0.9))
+    assert at_rest.uncertainty.values[1] == 1 and at_rest.uncertainty.standard_errors[1] == 0
+    assert not any("ratios[0]" in told for told in at_rest.warnings)
+    np.testing.assert_allclose(at_rest.uncertainty.values[0], fit.uncertainty.values[0] / 1.1)
 
 
 def test_the_error_of_the_gap_is_in_all_of_them(chosen):

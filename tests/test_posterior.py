@@ -70,6 +70,25 @@ def test_a_given_size_of_errors_is_only_ever_enlarged():
         assert ours[1] + constant == pytest.approx(np.log(above), rel=1e-5)
 
 
+#: The logarithm of the regularised lower incomplete gamma function P(m / 2, square / 2), for (m, square), from mpmath
+#: with 40 digits.
+MPMATH = {
+    (400, 1.0): -1002.3589326739,
+    (1000, 80.0): -806.80753833155,
+    (1000, 200.0): -408.5228443913,
+    (100000, 2000.0): -146607.45889846,
+}
+
+
+def test_residuals_far_below_the_given_errors_have_a_likelihood():
+    """The integral underflowed where the residuals are smallest: the best fit had the likelihood 0."""
+    for (m, square), log_p in MPMATH.items():
+        squares = np.array([square, 2.0 * m])  # one value underflows, the other one does not
+        found, free = (posterior.log_likelihood(squares, m, given) for given in (True, False))
+        assert (found - free)[0] == pytest.approx(log_p, rel=1e-10)
+        assert (found - free)[1] == pytest.approx(0.0, abs=1e-6)
+
+
 def one_mode(noise: float, seed: int) -> Sweep:
     rng = np.random.default_rng(seed)
     model = generalised_maxwell.Maxwell(np.float64(700.0), np.array([0.4]), np.array([0.3]))

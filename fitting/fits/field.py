@@ -63,11 +63,12 @@ class Field(NamedTuple):
     components: int  # number of measured displacement components
     reached: bool  # whether chi^2 is at most the number of components
     distance: float  # distance to the minimum: length of the next Gauss-Newton step, in standard deviations
-    history: list[dict]  # one entry for each prior deviation: chi2, iterations, evaluations, seconds
+    history: list[dict]  # one entry for each prior deviation, with the names in `_HISTORY`
     eigenvalues: np.ndarray  # largest eigenvalues of J^T J; the data determine the directions of z with values > 1
     codes: tuple[int, ...]
     seconds: float
     given: np.ndarray  # (E,) True where a [[region]] of the scene, not the map, sets the modulus
+    level_sd: float  # standard deviation of a constant added to m, from the data alone, if the rest of m were known
 
 
 def start_of(problem: Problem, name: str) -> jax.Array:
@@ -247,12 +248,17 @@ class _Search:
             with h5py.File(self.file) as f:
                 refuse_other(self.file, f.attrs, self.marks)
                 self.z, self.k = f["z"][:], int(f["k"][()])
-                self.history = [dict(zip(_HISTORY, map(float, row), strict=True)) for row in f["history"][:]]
+                rows = f["history"][:]
+            # Files of older versions do not state whether a search converged, so their last search continues.
+            rows = np.pad(rows, ((0, 0), (0, max(0, len(_HISTORY) - rows.shape[1]))))
+            self.history = [dict(zip(_HISTORY, map(float, row), strict=True)) for row in rows]
         except (OSError, KeyError):  # not an HDF5 file, or a file of another program
             raise InputError(f"{self.file} belongs to another fit: remove --resume, or give another --out") from None
 
 
-_HISTORY = ("deviation", "chi2_per_component", "iterations", "evaluations", "seconds")
+#: Names of the numbers in an entry of the history. `converged` is 1 if the search ended at the minimum, and 0 if it
+#: stopped before.
+_HISTORY = ("deviation", "chi2_per_component", "iterations", "evaluations", "seconds", "converged")
 
 
 class MapOptions(NamedTuple):
@@ -308,11 +314,10 @@ def estimate(
     before, after = smooth.variances(p, vectors, 1 / (1 + values))
     slope, chi2 = here.gradient(), float(here.r @ here.r)
     given, its_values = given_by_regions(problem, name)
-    modulus = np.asarray(values_at(problem, name, base, here.m)[name])
     return Field(
         name=name,
         log_factor=m,
-        modulus=np.where(given, its_values, modulus),
+        modulus=np.where(given, its_values, np.asarray(values_at(problem, name, base, here.m)[name])),
         given=given,
         sd=deviation * np.sqrt(after),
         prior_sd=deviation * np.sqrt(before),
@@ -327,6 +332,7 @@ def estimate(
         eigenvalues=values,
         codes=here.codes,
         seconds=time.perf_counter() - begin,
+        level_sd=1 / max(float(np.linalg.norm(_pushed(here.J, jnp.ones_like(here.m)))), 1e-300),
     )
 
 
@@ -335,7 +341,8 @@ def _deviations_in_turn(search: _Search, max_iterations: int) -> None:
     components or no longer falls. Each search begins at the result of the previous search."""
     while True:
         # If the program was stopped after this search had finished, the history already has the entry of this search.
-        finished = len(search.history) > search.k and search.history[search.k]["iterations"] < max_iterations
+        # A search that stopped before its minimum, for example at its limit of iterations, continues.
+        finished = len(search.history) > search.k and search.history[search.k]["converged"] > 0
         if not finished:
             search.history = [*search.history[: search.k], _minimised(search, max_iterations)]
             search.write()
@@ -363,7 +370,7 @@ def _minimised(search: _Search, max_iterations: int) -> dict[str, float]:
     search.z = found.x
     r = search.at(found.x).r
     chi2, seconds = float(r @ r) / search.problem.components, time.perf_counter() - begin
-    row = (DEVIATIONS[search.k], chi2, found.nit, search.evaluations - before, seconds)
+    row = (DEVIATIONS[search.k], chi2, found.nit, search.evaluations - before, seconds, found.success)
     return dict(zip(_HISTORY, map(float, row), strict=True))
 
 
@@ -420,19 +427,23 @@ def distance_sentence(found: Field) -> str | None:
 
 
 #: If the standard deviation of ln(modulus) exceeds this value at every node, the data do not determine the level of the
-#: map.
+#: map. The same holds if the standard deviation of the level from the data alone exceeds this value. The second test is
+#: needed because the prior limits the standard deviation at the nodes.
 OPEN = 0.5
 
 
 def level_sentence(found: Field) -> str | None:
-    """Return a warning if the data determine the modulus at none of the nodes, otherwise None."""
+    """Return a warning if the data do not determine the level of the map (`OPEN`), otherwise None."""
     least = float(np.min(found.sd))
-    if not least > OPEN:
+    if least > OPEN:
+        size = f"at every node, the modulus is uncertain by a factor of {np.exp(least):.2g} or more"
+    elif found.level_sd > OPEN:
+        size = "only the prior ties the mean modulus to the value in the scene, and the standard deviations assume this"
+    else:
         return None
     return (
-        "the data do not determine the level of the map: at every node, the modulus is uncertain by a factor of "
-        f"{np.exp(least):.2g} or more. Displacements alone determine only ratios of moduli, so give a traction or a "
-        "measured force"
+        f"the data do not determine the level of the map: {size}. Displacements alone determine only ratios of moduli, "
+        "so give a traction or a measured force"
     )
 
 

@@ -19,7 +19,7 @@ from fitting.fits.honesty import total_error
 from fitting.fits.honesty.edges import HALF_DECADE
 from fitting.fits.viscoelastic import Fit, Kind
 from fitting.methods import as_prony_modes, generalised_maxwell, host, uncertainty
-from fitting.methods.estimate import Estimate, estimated, wider
+from fitting.methods.estimate import Estimate, wider
 from fitting.methods.generalised_maxwell import Maxwell, weighed
 from fitting.readers import raw_torque
 from fitting.readers.frequency_sweep import Sweep, some
@@ -385,13 +385,11 @@ def of_compressed_sample(fit: Fit, sweep: Sweep, factors: compression.Shares) ->
         sweep: the measured moduli.
         factors: factors by which the compression changes the relaxing and the equilibrium moduli.
     """
-    kind, own, details = _kind_at_rest(fit.kind, factors), fit.parameters, fit.details
+    kind, details = _kind_at_rest(fit.kind, factors), fit.details
     if kind.moduli is not None:
         kind, details = _of_own_moduli(kind, fit, sweep)
-    rows = (2 * len(fit.storage), kind.effective)
-    spread = uncertainty.estimate(fit.solution, sweep.noise_given, kind.maxwell, rows)
-    if kind.values is not None:
-        own = estimated(kind.names, kind.values, fit.solution, rows[0], sweep.noise_given, kind.effective)
+    data = (2 * len(fit.storage), sweep.noise_given)
+    spread, own = viscoelastic.estimates(fit.solution, kind, data, fit.noise_root)
     modes = len(spread.values) // 2
     model = Maxwell(spread.values[0], spread.values[1 : modes + 1], spread.values[modes + 1 :])
     old, new = (

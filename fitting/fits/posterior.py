@@ -134,9 +134,23 @@ def log_likelihood(square: np.ndarray, count: int, deviations_given: bool) -> np
     """Return the logarithm of the integral of s^-m exp(-square / (2 s^2)) ds / s over all s, up to a constant. Here s
     is the common factor of the errors, and `square` is the sum of m = `count` squared residuals (at least m times
     `QUIETEST`^2). If `deviations_given`, the integral is only over s >= 1."""
-    half = 0.5 * np.maximum(square, QUIETEST**2 * count)
-    out = -0.5 * count * np.log(half)
-    return out + np.log(scipy.special.gammainc(0.5 * count, half)) if deviations_given else out
+    a, half = 0.5 * count, 0.5 * np.maximum(square, QUIETEST**2 * count)
+    out = -a * np.log(half)
+    return out + _log_gammainc(a, half) if deviations_given else out
+
+
+#: If the incomplete gamma function is below this value, its logarithm is computed from a series, because the function
+#: underflows to 0 at slightly smaller values.
+_TINY = 1e-290
+
+
+def _log_gammainc(a: float, x: np.ndarray) -> np.ndarray:
+    """Return the logarithm of the regularised lower incomplete gamma function P(a, x), also where P underflows."""
+    direct, low = scipy.special.gammainc(a, x), np.minimum(x, a)  # P underflows only where x is far below a
+    # P(a, x) = x^a exp(-x) / Gamma(a + 1) times the series 1 + x/(a + 1) + x^2/((a + 1)(a + 2)) + ...
+    series = np.log(scipy.special.hyp1f1(1.0, a + 1, low))
+    series += a * np.log(low) - low - scipy.special.gammaln(a + 1)
+    return np.where(direct > _TINY, np.log(np.maximum(direct, _TINY)), series)
 
 
 def target(

@@ -107,10 +107,10 @@ def _modes_for_all(
     """Return the fits of all samples with 1, 2, … Prony modes. The search ends after an exact fit. It also ends after
     two numbers of modes in a row that do not lower the summed criterion or that most samples do not determine."""
     largest = min(generalised_maxwell.largest_number_of_modes(s) for s in sweeps)
+    for s in sweeps:
+        viscoelastic.check_modes(s, 1 if modes == "auto" else modes)
     numbers = range(1, min(largest, min(map(uncertainty.supported_modes, sweeps))) + 1)
     if modes != "auto":
-        for s in sweeps:
-            viscoelastic.check_modes(s, modes)
         numbers = range(int(modes), int(modes) + 1)
     tried: list[_Candidate] = []
     failures = 0

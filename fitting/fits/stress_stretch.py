@@ -1,7 +1,6 @@
 """Hyperelastic laws, fitted to stress-stretch curves by least squares from many starting points. A stress of the
 law that falls within the range of the data adds a penalty to the residuals."""
 
-import itertools
 import time
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -217,7 +216,7 @@ def assessed(
         limits=limits,
     )
     told = _warnings(result, curves, s, bool(np.any(r[n:] < 0)))
-    told += _of_noise(alike, factors, n, len(curves))
+    told += _of_noise(alike, factors, n, len({c.sample or c.label for c in curves}))
     told += _of_hidden_factors(factors, np.array(candidate.names)[known], values[known], errors[known])
     if of_tests and not limits:
         told += _of_other_minima(candidate, values, np.asarray(found.u)[costs <= lowest], scale, curves)
@@ -310,10 +309,11 @@ def _errors_of_law(
     if of_tests:
         roots.append(growing_root(J, misfit, fitted, slope))
     alike, factors, counts = None, None, [len(c.stress) for c in curves]
-    samples = [sum(len(c.stress) for c in own) for _, own in itertools.groupby(curves, lambda c: c.sample or c.label)]
+    sample = np.repeat(np.unique([c.sample or c.label for c in curves], return_inverse=True)[1], counts)
     if J.size and noise > EXACT:  # otherwise the residuals are roundoff
         alike = along_rows(counts, misfit, J, noise, np.linalg.pinv(J))
-        factors = factors_of_series(samples, J, misfit, fitted, slope) if of_tests else None
+        rows, each = np.argsort(sample, kind="stable"), np.bincount(sample).tolist()
+        factors = factors_of_series(each, J[rows], misfit[rows], fitted[rows], slope) if of_tests else None
     if alike is not None:
         roots.append(slope @ alike.root)
     if factors is not None:

@@ -199,7 +199,7 @@ def _one_model(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind) -> Time
     found = from_starts(evaluate, _starts(test, modes, kind), *data)
     running = perf_counter() - begin
     model = Maxwell(*(np.asarray(v) for v in kind.maxwell(found.u)))
-    spread = uncertainty.estimate(found, False, kind.maxwell)
+    spread = uncertainty.estimate(found, False, kind.maxwell, fluid=kind.name == FLUID.name)
     fitted = np.asarray(found.residuals) * scales + test.answer[rows]
     at = (test.time[rows], test.answer[rows], fitted, scales)
     return TimeFit(kind, model, found, spread, bool(found.converged), *at, (), running, 0.0, {})

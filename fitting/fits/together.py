@@ -232,7 +232,7 @@ def _one_test(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind)
     running = time.perf_counter() - begin
     shares, fitted = misfits(tests, data, np.asarray(found.residuals), noise, len(found.u))
     found = over_own_noise(found, shares, used / noise)
-    spreads = uncertainty.estimate(found, True, kind.maxwell)
+    spreads = uncertainty.estimate(found, True, kind.maxwell, fluid=kind.name == FLUID.name)
     model = Maxwell(*(np.asarray(v) for v in kind.maxwell(found.u)))
     return Together(tests, kind, model, found, spreads, bool(found.converged), shares, fitted, [], (), running, 0.0)
 

@@ -54,6 +54,7 @@ class Fit(NamedTuple):
     kind: Kind = Kind()
     parameters: Estimate | None = None  # parameters of another model; None: the modes are the parameters
     rivals: tuple["Fit", ...] = ()  # fits of the other models that could have been chosen
+    noise_root: np.ndarray | None = None  # see `root_of_noise_shown`; None: no such noise is used
 
     @property
     def modes(self) -> int:
@@ -185,15 +186,9 @@ def fit_at(sweep: Sweep, at: BestPoint, kind: Kind, seconds: tuple[float, float]
     """Return the fit at a minimum, with its errors and warnings. `seconds`: time of the run, and time of
     compilation."""
     found, storage, loss = at.solution, at.storage, at.loss
-    spread = uncertainty.estimate(found, sweep.noise_given, kind.maxwell, (2 * len(storage), kind.effective))
-    own = None
-    if kind.values is not None:
-        rows = (2 * len(storage), sweep.noise_given, kind.effective)
-        own = uncertainty.estimated(kind.names, kind.values, found, *rows)
-    if not sweep.noise_given and kind.effective is None and len(found.residuals) == 2 * len(storage):
-        omega, natural_of = sweep.angular_frequency, partial(uncertainty.parameter_vector, maxwell=kind.maxwell)
-        spread = _of_noise_shown(spread, natural_of, found, omega)
-        own = None if own is None or kind.values is None else _of_noise_shown(own, kind.values, found, omega)
+    own_noise = not sweep.noise_given and kind.effective is None and len(found.residuals) == 2 * len(storage)
+    noise_root = root_of_noise_shown(found, sweep.angular_frequency) if own_noise else None
+    spread, own = estimates(found, kind, (2 * len(storage), sweep.noise_given), noise_root)
     sentences = _misfit(sweep, storage, loss, kind)
     sentences += tuple(uncertainty.cautions(sweep, spread, kind.name) if own is None else ())
     converged = bool(found.converged)
@@ -207,34 +202,63 @@ def fit_at(sweep: Sweep, at: BestPoint, kind: Kind, seconds: tuple[float, float]
     modes = len(spread.values) // 2
     model = Maxwell(spread.values[0], spread.values[1 : modes + 1], spread.values[modes + 1 :])
     details = details | {"iterations": int(found.iterations), "gradient": float(found.gradient)}
-    return Fit(at.method, model, found, spread, converged, storage, loss, sentences, *seconds, details, kind, own)
+    result = Fit(at.method, model, found, spread, converged, storage, loss, sentences, *seconds, details, kind, own)
+    return result._replace(noise_root=noise_root)
 
 
-def _of_noise_shown(
-    estimate: Estimate, natural_of: Callable[[Array], Array], found: Solution, omega: np.ndarray
+def estimates(
+    found: Solution, kind: Kind, data: tuple[int, bool], noise_root: np.ndarray | None
+) -> tuple[Estimate, Estimate | None]:
+    """Return the estimate of the Prony modes, and that of the parameters of another model (None if the modes are the
+    parameters).
+
+    Args:
+        found: the minimum over the variables u of `kind`.
+        kind: the meaning of u.
+        data: number of measured residuals, and whether the data have standard deviations.
+        noise_root: see `root_of_noise_shown`.
+    """
+    count, given = data
+    fluid, own = kind.name == FLUID.name, None
+    spread = uncertainty.estimate(found, given, kind.maxwell, (count, kind.effective), fluid)
+    spread = of_noise_shown(spread, partial(uncertainty.parameter_vector, maxwell=kind.maxwell), found.u, noise_root)
+    if kind.values is not None:
+        own = uncertainty.estimated(kind.names, kind.values, found, count, given, kind.effective)
+        own = of_noise_shown(own, kind.values, found.u, noise_root)
+    return spread, own
+
+
+def of_noise_shown(
+    estimate: Estimate, natural_of: Callable[[Array], Array], u: Array, noise_root: np.ndarray | None
 ) -> Estimate:
-    """Return the estimate with standard errors for the noise that the residuals show. This may be noise that is
-    correlated between repeated measurements at one frequency, or noise of different size in G' and G''."""
-    J, r, slope = np.asarray(found.jacobian), np.asarray(found.residuals), with_slope(natural_of, found.u)[1]
-    root = _of_repeats(J, r, slope, omega)
-    if root is None:
-        root = grouped_root(J, r, np.arange(len(r)) >= len(r) // 2, slope)
-    if root is None:
+    """Return the estimate with standard errors for the noise that the residuals show (`root_of_noise_shown`), or
+    unchanged if this is None. `natural_of`: function from u to the parameters of the estimate."""
+    if noise_root is None:
         return estimate
+    root = with_slope(natural_of, u)[1] @ noise_root
     errors, correlation = errors_and_correlation(root)
     errors = np.where(np.isfinite(estimate.standard_errors), errors, np.inf)
     return estimate._replace(root=root, standard_errors=errors, correlation=correlation)
 
 
-def _of_repeats(J: np.ndarray, r: np.ndarray, slope: np.ndarray, omega: np.ndarray) -> np.ndarray | None:
-    """Return the square root of the covariance of the parameters for noise that is correlated between repeated values
-    of G', or of G'', at one frequency. Returns None if the residuals show no such noise."""
+def root_of_noise_shown(found: Solution, omega: np.ndarray) -> np.ndarray | None:
+    """Return the square root (p, k) of the covariance of the p unknowns u for the noise that the residuals show. This
+    may be noise that is correlated between repeated measurements at one frequency, or noise of different size in G' and
+    G''. Returns None if the residuals show no such noise."""
+    J, r = np.asarray(found.jacobian), np.asarray(found.residuals)
+    root = _of_repeats(J, r, omega)
+    return grouped_root(J, r, np.arange(len(r)) >= len(r) // 2, np.eye(J.shape[1])) if root is None else root
+
+
+def _of_repeats(J: np.ndarray, r: np.ndarray, omega: np.ndarray) -> np.ndarray | None:
+    """Return the square root of the covariance of the unknowns for noise that is correlated between repeated values of
+    G', or of G'', at one frequency. Returns None if the residuals show no such noise."""
     of_row = np.concatenate([omega, omega + 2 * omega.max()])  # G' and G'' form separate groups
     _, group, counts = np.unique(of_row, return_inverse=True, return_counts=True)
     if np.median(counts) < 2:
         return None
     order = np.argsort(group, kind="stable")
-    shared = factors_of_series(counts.tolist(), J[order], r[order], np.ones(len(r)), slope)
+    shared = factors_of_series(counts.tolist(), J[order], r[order], np.ones(len(r)), np.eye(J.shape[1]))
     return shared.root if shared is not None and shared.shown else None
 
 

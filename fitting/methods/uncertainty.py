@@ -37,6 +37,7 @@ def estimate(
     deviations_given: bool,
     maxwell: Callable[[Array], Maxwell] = generalised_maxwell.natural,
     components: tuple[int, float | None] | None = None,
+    fluid: bool = False,
 ) -> Estimate:
     """Return values, standard errors and correlation of G0, ratios and relaxation times at the minimum.
 
@@ -46,13 +47,14 @@ def estimate(
         maxwell: function from u to Prony modes; by default `generalised_maxwell.natural`.
         components: number of measured residuals (default: all), and effective number of parameters (default: length of
             u).
+        fluid: whether u has no equilibrium modulus, so that the ratios add up to 1.
     """
     count, effective = components or (len(found.residuals), None)
 
     modes = jax.eval_shape(maxwell, found.u).ratios.shape[0]
     vector = partial(parameter_vector, maxwell=maxwell)
     own = estimated(parameter_names(modes), vector, found, count, deviations_given, effective)
-    if modes == 1 and maxwell is generalised_maxwell.natural_fluid:  # the ratio is exactly 1
+    if modes == 1 and fluid:  # the ratio is exactly 1
         own = own._replace(standard_errors=np.where(np.arange(len(own.values)) == 1, 0.0, own.standard_errors))
     return own
 

@@ -8,7 +8,7 @@ Biometrics 53, 603; for few data Hurvich and Tsai 1989, Biometrika 76, 297.
 import numpy as np
 
 from fitting.fits.honesty import alike_points
-from fitting.fits.viscoelastic import Fit, mean_square, number_of_parameters
+from fitting.fits.viscoelastic import Fit, mean_square, number_of_parameters, of_noise_shown
 from fitting.methods import generalised_maxwell, host
 from fitting.methods.estimate import Estimate, errors_and_correlation, estimated, wider
 from fitting.methods.generalised_maxwell import Maxwell
@@ -95,6 +95,7 @@ def _of_one_model(fit: Fit, omega: np.ndarray, noise_given: bool) -> Estimate:
 
     names = [f"{part} at {at:.3g} rad/s" for part in ("storage", "loss") for at in omega]
     found = estimated(names, of, fit.solution, 2 * len(fit.storage), noise_given, fit.kind.effective)
+    found = of_noise_shown(found, of, fit.solution.u, fit.noise_root)
     if alike_points.INDEPENDENT not in fit.details:
         return found
     alike = alike_points.alike_of(fit)
