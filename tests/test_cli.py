@@ -1,5 +1,6 @@
 """The command lines: files, exit codes, and one-line messages for unusable input."""
 
+import argparse
 import importlib
 import json
 import os
@@ -14,7 +15,7 @@ import pytest
 from conftest import ROOT
 
 from fitting.__main__ import main
-from fitting.commands import waves
+from fitting.commands import shared_options, waves
 from fitting.fits import sample_inertia
 from liverjax.__main__ import main as liverjax_main
 from liverjax.commands import exit_codes
@@ -353,3 +354,36 @@ def test_a_terminal_without_the_letter_and_a_full_disk(tmp_path):
     with open("/dev/full", "w") as full:
         run = subprocess.run(command, env=env, cwd=ROOT, stdout=full, stderr=subprocess.PIPE, text=True)
     assert run.returncode == 2 and "No space left on device" in run.stderr and "Traceback" not in run.stderr
+
+
+HEADER_IN_RAD = "angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa"
+
+
+def test_the_inertia_of_the_sample_is_taken_off_the_predicted_sweep_too(tmp_path, capsys):
+    """The sweep of the same sample was "predicted within 4.3 %", because its moduli contained the inertia."""
+    omega, rng = np.geomspace(1.0, 100.0, 12), np.random.default_rng(0)
+    seen = sample_inertia.shown(900.0 + 100.0j * omega * 0.05 / (1 + 1j * omega * 0.05), omega, 1060.0, 0.01)
+    for name in ("a.csv", "b.csv"):
+        moduli = np.stack([seen.real, seen.imag]) * (1 + 0.005 * rng.standard_normal((2, 12)))
+        rows = np.vstack([omega, moduli]).T
+        np.savetxt(tmp_path / name, rows, "%.12g", ",", header=HEADER_IN_RAD, comments="")
+    more = ["--density", "1060", "--height", "0.01", "--method", "closed-form", "--out", str(tmp_path)]
+    assert main([str(tmp_path / "a.csv"), *more, "--predict", str(tmp_path / "b.csv")]) == 0
+    shown = capsys.readouterr()
+    assert float(shown.out.split("predicted within ")[1].split()[0]) < 1
+    assert "note: b.csv: the inertia of the sample, 10 mm high, is subtracted" in shown.err
+
+
+@pytest.mark.parametrize(("method", "kept"), [("torsion", 25), ("closed-form", 21)])
+def test_the_torsion_knows_the_height_when_points_are_left_out(tmp_path, method, kept):
+    """The fit subtracts the inertia of a sample with the default height. Four points were left out before, because
+    their moduli contained this inertia."""
+    omega = 2 * np.pi * np.geomspace(0.1, 60, 25)
+    part, tau = np.array([0.3, 0.25, 0.2]), np.array([0.02, 0.4, 8.0])
+    G = 2000 * (0.25 + (part * 1j * omega[:, None] * tau / (1 + 1j * omega[:, None] * tau)).sum(axis=1))
+    seen = sample_inertia.shown(G, omega, 1060.0, 0.004)
+    rows = np.column_stack([omega, seen.real, seen.imag])
+    np.savetxt(tmp_path / "s.csv", rows, "%.12g", ",", header=HEADER_IN_RAD, comments="")
+    none = dict.fromkeys(("table", "min_frequency", "max_frequency", "radius", "height"))
+    options = argparse.Namespace(**none, density=1060.0, method=method)
+    assert len(shared_options.usable_sweep(options, tmp_path / "s.csv").storage) == kept

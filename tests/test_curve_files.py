@@ -329,3 +329,11 @@ def test_a_wrong_row_is_named(tmp_path):
     (tmp_path / "a.csv").write_text(f"test,stretch,nominal_stress_Pa\n{rows}")
     notes = curves.read_curves([tmp_path / "a.csv"])[1]
     assert sum(f"the stress {stress[20]:.4g} Pa at 1.282 is far from its neighbours" in note for note in notes) == 1
+
+
+def test_a_column_of_deviations_is_not_the_column_of_the_stress(tmp_path):
+    """Rows without a standard deviation were ignored as rows without a stress."""
+    rows = "".join(f"uniaxial,{1 + 0.05 * k},{'' if k % 2 else 0.1},{k}\n" for k in range(1, 9))
+    (tmp_path / "c.csv").write_text(f"test,stretch,nominal_stress_sd_kPa,nominal_stress_kPa\n{rows}")
+    (found,), notes = curves.read_curves([tmp_path / "c.csv"])
+    assert np.allclose(found.stress, 1e3 * np.arange(1, 9)) and not any("without a stress" in note for note in notes)

@@ -234,6 +234,10 @@ SPOILED = {
         HEAD.replace("_deg", "") + "1,10,0.2\n2,11,0.3\n3,12,0.3\n",
         "column phase may be in degrees or radians; name this column",
     ),
+    "deviation of the phase without unit": (
+        HEAD.replace("\n", ",phase_sd\n") + "1,10,20,0.2\n2,11,30,0.3\n3,12,30,0.3\n",
+        "column phase_sd may be in degrees or radians; name this column phase_sd_deg or phase_sd_rad",
+    ),
     "no angle": ("frequency_Hz,complex_modulus_Pa\n1,2\n2,3\n", "no column for loss.*phase_angle_deg or tan_delta"),
     "no modulus": ("frequency_Hz,phase_deg\n1,2\n2,3\n", "no column for storage.*add storage_modulus_Pa"),
     "two angles": ("frequency_Hz,tan_delta,phase_deg\n1,2,3\n2,3,3\n", "no column for storage.*add"),

@@ -321,3 +321,49 @@ def test_twenty_measured_tables_make_one_curve():
     # A smooth spectrum with 2 times per decade follows 14 decades. Half a decade at the cold end is noise.
     fit = models.spectrum_fit(found.sweep)
     assert np.mean(fit.relative_errors(found.sweep)) < 0.015 and fit.details["spectrum"]["decades_carried"] > 12
+
+
+def parts_of(noise: dict[int, float], omegas: list[np.ndarray], log_a: np.ndarray, seed: int = 0) -> list[Sweep]:
+    """Return sweeps with their own frequencies, shifts and relative noise (default 0)."""
+    rng, out = np.random.default_rng(seed), []
+    for k, (omega, a) in enumerate(zip(omegas, log_a, strict=True)):
+        G, factor = moduli_of_polymer(10**a * omega), 1 + noise.get(k, 0.0) * rng.standard_normal((2, len(omega)))
+        out.append(Sweep(omega, G.real * factor[0], G.imag * factor[1]))
+    return out
+
+
+def test_errors_of_factors_contain_the_noise_of_each_sweep():
+    """All sweeps counted as equally noisy. The errors of the one with 4 % of noise were 4 to 5 times too small."""
+    z, log_a = [], np.array([0.0, -0.8, -1.6])
+    omegas = [np.geomspace(0.1, 100, n) for n in (61, 61, 10)]
+    for seed in range(12):
+        found = shifts.found(parts_of({0: 0.003, 1: 0.003, 2: 0.04}, omegas, log_a, seed), TEMPERATURES[:3], 0)
+        z.append((found.log_a - log_a)[1:] / found.log_a_errors[1:])
+    assert np.all(np.sqrt(np.mean(np.square(z), axis=0)) < 1.7)
+    # The mean over the sweeps, not over the points, was given as the distance of all points.
+    assert np.isclose(found.apart, np.sqrt(np.average(found.misfit**2, weights=[61, 61, 10])))
+
+
+def test_a_long_sweep_is_shifted_onto_a_short_neighbour():
+    """The overlap had to be a quarter of the long sweep, which is more than the whole short sweep."""
+    omegas, log_a = [np.geomspace(0.1, 10, 15), np.geomspace(0.1, 1, 8), np.geomspace(1e-3, 100, 26)], [0, -0.5, -1.0]
+    found = shifts.found(parts_of({}, omegas, np.array(log_a)), TEMPERATURES[:3], 0)
+    assert np.allclose(found.log_a, log_a, atol=1e-3)
+
+
+def test_missing_factors_and_missing_deviations_are_told(tmp_path):
+    """One empty cell made all given factors unused, and one file without deviations those of all others, without a
+    note."""
+    write_rows(tmp_path / "a.csv", factors=True)
+    head, *rows = (tmp_path / "a.csv").read_text().splitlines()
+    empty = [row.rpartition(",")[0] + "," for row in rows]
+    n = len(OMEGA)
+    (tmp_path / "a.csv").write_text("\n".join([head, empty[0], *rows[1:]]))
+    data = temperature_sweeps.read_temperatures([tmp_path / "a.csv"])
+    assert np.allclose(data.shift_factors, 10**TRUE)
+    (tmp_path / "a.csv").write_text("\n".join([head, *empty[:n], *rows[n:]]))
+    data = temperature_sweeps.read_temperatures([tmp_path / "a.csv"])
+    assert data.shift_factors is None and any("shift_factor are not used" in note for note in data.sweeps[0].notes)
+    one, other, *_ = sweeps(0.0)
+    both = temperature_sweeps.joined([one._replace(storage_sd=one.storage, loss_sd=one.loss), other])
+    assert both.storage_sd is None and "the standard deviations are not used" in both.notes[0]

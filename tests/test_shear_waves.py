@@ -169,7 +169,7 @@ def test_the_structure_of_velocities_and_attenuations_is_tested_separately():
 def test_the_inertia_that_stays_in_the_sweeps_is_told_beside_waves(capsys):
     """With shear waves, --density without --height left the inertia in the sweep without a note."""
     tests = [sweep(0.0), waves(0.0)]
-    assert together_command._without_sample_inertia(tests, 1060.0, None) == tests
+    assert together_command.without_sample_inertia(tests, 1060.0, None) == tests
     assert "--density without --height subtracts no inertia" in capsys.readouterr().err
 
 

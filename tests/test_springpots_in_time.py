@@ -202,3 +202,18 @@ def test_fish_muscle_relaxes_as_two_springpots_in_a_row():
     test = time_tests.read_time_test(file, "relaxation", time_tests.Sample(None, None), 0.0, 0.0)
     found = springpots_in_time.choose_in_time(test, "fractional")
     assert found.kind.name == "fractional_maxwell" and found.relative_errors.mean() < 0.004
+
+
+def test_the_spectrum_of_a_relaxation_test_gets_a_note_instead_of_draws(tmp_path, capsys):
+    """If `auto` chose the spectrum, --samples ended in a traceback and nothing was written."""
+    t, tau = np.geomspace(0.01, 1000, 60), np.geomspace(1e-5, 1e6, 200)
+    weights = np.exp(-0.5 * (np.log(tau) / 4.5) ** 2)
+    G = 300 + 700 * np.exp(-t[:, None] / tau) @ (weights / weights.sum())
+    G = G * (1 + 1e-3 * np.random.default_rng(0).standard_normal(60))
+    rows = np.column_stack([t, np.full(60, 0.01), 0.01 * G])
+    np.savetxt(tmp_path / "r.csv", rows, "%.12g", ",", header="time_s,strain [1],stress_Pa", comments="")
+    ask = ["--ramp", "0", "--model", "auto", "--samples", "100", "--out", str(tmp_path)]
+    assert main(["relaxation", str(tmp_path / "r.csv"), *ask]) == 0
+    shown = capsys.readouterr()
+    assert "note: --samples works only with models of a few parameters" in shown.err
+    assert "relaxation, spectrum" in shown.out and (tmp_path / "fit.json").is_file()

@@ -11,6 +11,7 @@ from test_time_tests import write
 from fitting.__main__ import main
 from fitting.readers.tables.time_columns import read_columns
 from fitting.readers.time_tests import read_time_test
+from liverjax.core.errors import InputError
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -154,3 +155,11 @@ def test_a_balance_shows_forces_in_grams(tmp_path):
     (tmp_path / "t.csv").write_text("time_s,displacement_mm,force_g\n" + rows)
     force = read_columns(tmp_path / "t.csv")[0]["force"]
     assert np.allclose(force, 9 * np.arange(9) * 9.80665e-3)  # standard gravity, CGPM 1901
+
+
+def test_a_tensile_test_without_a_whole_row_is_refused(tmp_path):
+    """A file of shear got this sentence, and a file of tension a traceback."""
+    rows = "".join(f"{k},,{k}\n" for k in range(6))
+    (tmp_path / "t.csv").write_text("time_s,tensile strain [1],tensile stress [Pa]\n" + rows)
+    with pytest.raises(InputError, match="every row has a cell that is empty or not finite; give numbers"):
+        read_columns(tmp_path / "t.csv")

@@ -129,7 +129,7 @@ def run(options: argparse.Namespace) -> int:
         rig = Simulation(radius=options.radius or default.radius, height=options.height or default.height)
         found.details["geometry_error"] = total_error.of_geometry(rig, None)
     posterior = None
-    if options.samples:
+    if options.samples and shared_options.has_draws(found.kind):
         from fitting.fits.posterior import of_time_test
 
         posterior = of_time_test(found, test, options.samples)

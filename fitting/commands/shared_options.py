@@ -13,6 +13,7 @@ from liverjax.core.errors import InputError
 
 if TYPE_CHECKING:
     from fitting.fits.stress_stretch import LawFit
+    from fitting.fits.viscoelastic import Kind
     from fitting.methods.generalised_maxwell import Maxwell
     from fitting.readers.frequency_sweep import Sweep
 
@@ -71,6 +72,18 @@ def check_samples(count: int | None) -> None:
         raise InputError(f"--samples {count} is out of range: give 100 to 100000 draws of each chain, e.g. 1000")
 
 
+def has_draws(kind: "Kind") -> bool:
+    """Return whether the posterior of a fit with this kind of model can be drawn (--samples). A note is printed if it
+    cannot, because the model is the spectrum."""
+    if kind.effective is None:
+        return True
+    print(
+        "note: --samples works only with models of a few parameters; for the spectrum, use its standard errors",
+        file=sys.stderr,
+    )
+    return False
+
+
 def write_cards(out: Path, model: "Maxwell") -> None:
     """Write material cards, and print notes on everything that a program cannot represent."""
     from fitting.reports import material_cards
@@ -100,22 +113,26 @@ def usable_sweep(options: argparse.Namespace, path: Path) -> "Sweep":
 
 def without_instrument_or_sample(options: argparse.Namespace, sweep: "Sweep") -> "Sweep":
     """Return the sweep without the points at which the instrument dominates. The moduli still contain the inertia of
-    the sample. If density and height of the sample are given, these points are searched in moduli without the inertia
-    of the sample. So this inertia is not mistaken for the inertia of the instrument."""
+    the sample. If density and height of the sample are known, these points are searched in moduli without the inertia
+    of the sample. So this inertia is not mistaken for the inertia of the instrument. With --method torsion, the default
+    of --height is used, as in the fit."""
     from fitting.fits import sample_inertia
+    from fitting.fits.simulated_rheometer import Simulation
     from fitting.methods import kramers_kronig
     from fitting.readers.rheometer import some
     from fitting.rigs import compression
     from liverjax import laws
 
-    density = getattr(options, "density", None)
-    if density is None or options.height is None:
+    density, height = getattr(options, "density", None), options.height
+    if height is None and getattr(options, "method", None) == "torsion":
+        height = Simulation().height
+    if density is None or height is None:
         return kramers_kronig.without_instrument(sweep)
     strain = getattr(options, "precompression", 0.0)
     try:
         if strain:
             density = compression.torsional_density(laws.typical(options.law), strain, density)
-        bare = sample_inertia.taken_off(sweep, density, options.height)
+        bare = sample_inertia.taken_off(sweep, density, height)
     except InputError:  # a later step subtracts the inertia, and raises the error with its remedy
         return kramers_kronig.without_instrument(sweep)
     kept = kramers_kronig.without_instrument(bare)

@@ -226,12 +226,13 @@ def _master(options: argparse.Namespace) -> tuple["Sweep", dict, str]:
 
 
 def _tests_to_predict(options: argparse.Namespace) -> list["Measured"]:
-    """Read the tests that the fit predicts (--predict)."""
+    """Read the tests that the fit predicts (--predict). The inertia of the sample is subtracted as in the fit."""
     if not options.predict:
         return []
-    from fitting.commands.together import read_any
+    from fitting.commands import together
 
-    tests = [read_any(options, path, whole=True) for path in options.predict]
+    tests = [together.read_any(options, path, whole=True) for path in options.predict]
+    tests = together.without_sample_inertia(tests, *(_simulation(options).inertia or (None, None)))
     for test in tests:
         for note in test.notes:
             print(f"note: {Path(test.source).name}: {note}", file=sys.stderr)
@@ -484,13 +485,7 @@ def _posterior(options: argparse.Namespace, sweep: "Sweep", fit: "Fit") -> "Post
     """Draw from the posterior of the last fit, if the user asks for this and the model has only a few parameters."""
     from fitting.fits import posterior, sample_inertia
 
-    if not options.samples:
-        return None
-    if fit.kind.prior is not None:
-        print(
-            "note: --samples works only with models of a few parameters; for the spectrum, use its standard errors",
-            file=sys.stderr,
-        )
+    if not options.samples or not shared_options.has_draws(fit.kind):
         return None
     if fit.method == "torsion":
         simulation = _simulation(options).run

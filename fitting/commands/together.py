@@ -23,7 +23,7 @@ def run(options: argparse.Namespace) -> int:
 
     first = shared_options.usable_sweep(options, options.sweep[0])
     tests = [first, *(read_any(options, path) for path in options.others)]
-    tests = _without_sample_inertia(tests, options.density, options.height)
+    tests = without_sample_inertia(tests, options.density, options.height)
     for test in tests:
         for note in test.notes:
             print(f"note: {Path(test.source).name}: {note}", file=sys.stderr)
@@ -43,7 +43,7 @@ def run(options: argparse.Namespace) -> int:
     return 0 if found.converged else 1
 
 
-def _without_sample_inertia(tests: "list[Measured]", density: float | None, height: float | None) -> "list[Measured]":
+def without_sample_inertia(tests: "list[Measured]", density: float | None, height: float | None) -> "list[Measured]":
     """Return the tests. The inertia of the sample is subtracted from the sweeps if the density and the height of the
     sample are given."""
     from fitting.fits import sample_inertia

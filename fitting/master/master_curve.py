@@ -132,7 +132,7 @@ def _factors_of_moduli(sweeps: list[Sweep], found: Shifts) -> list[str]:
     except InputError:
         return []
     more, data = len(sweeps) - 1, sum(2 * len(s.storage) for s in sweeps)
-    ratio = shifts.sum_of_squares(sweeps, alone) / max(shifts.sum_of_squares(sweeps, both), np.finfo(float).tiny)
+    ratio = shifts.sum_of_squares(alone) / max(shifts.sum_of_squares(both), np.finfo(float).tiny)
     freedom = data - 2 * more - 2 * shifts.size_of_curve(sweeps, both.log_a, knots)
     if (
         freedom < 1

@@ -3,7 +3,8 @@
 The modulus at temperature T and frequency omega is 1 / b_T times the modulus at the reference temperature and frequency
 a_T omega. The curve is a cubic spline of log G' and of log G'' over log frequency. The curve and all factors are fitted
 together by least squares. So no model of the material is needed, and every factor has a standard error. If the noise
-differs between log G' and log G'', they get different weights. The distance between the knots of the spline is chosen
+differs between log G' and log G'', they get different weights. If it differs between the sweeps, their weights stay
+equal, and the standard errors contain the noise of each sweep. The distance between the knots of the spline is chosen
 from the data, because a curve that follows the noise would be steeper than the true curve. Then the errors of the
 factors, which depend on the slope of the curve, would be too small. Source: Ferry (1980), Viscoelastic properties of
 polymers, chapter 11.
@@ -14,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import BSpline
+from scipy.special import chdtrc
 
 from fitting.readers.frequency_sweep import Sweep, merged, scatter
 from fitting.readers.units import celsius
@@ -24,13 +26,14 @@ from liverjax.core.errors import InputError
 KNOTS, SMOOTH = (0.4, 0.6, 0.9, 1.35, 2.0, 3.0), 1e-3
 #: LONGEST: maximum step of a factor in one iteration [decades]. The iteration ends if all steps are below CONVERGED.
 LONGEST, CONVERGED = 0.3, 1e-6
-#: Settings for the first estimate of a shift. OVERLAP: minimum fraction of a sweep that must overlap with the
-#: neighbouring sweep. REACH: shifts that are tried [decades].
+#: Settings for the first estimate of a shift. OVERLAP: minimum fraction of the shorter of two neighbouring
+#: sweeps that must overlap with the other one. REACH: shifts that are tried [decades].
 OVERLAP, REACH = 0.25, np.linspace(-8.0, 8.0, 801)
 #: CHANCE: G' and G'' get different weights if the probability that their distances from the curves differ so much by
-#: chance is below this value. ROUNDS: maximum number of fits, each followed by new weights. SETTLED: the fits end if no
-#: weight changes by more than this fraction. MOST: largest ratio of the weights.
-CHANCE, ROUNDS, SETTLED, MOST = 1e-3, 8, 0.02, 100.0
+#: chance is below this value. The same limit holds for the noise of the sweeps in the standard errors. LEAST_DEGREES:
+#: degrees of freedom needed to estimate the noise of a sweep. ROUNDS: maximum number of fits, each followed by new
+#: weights. SETTLED: the fits end if no weight changes by more than this fraction. MOST: largest ratio of the weights.
+CHANCE, LEAST_DEGREES, ROUNDS, SETTLED, MOST = 1e-3, 3.0, 8, 0.02, 100.0
 #: Two sweeps match within the noise if their mean square distance, divided by the variance of their noise, is at most
 #: this value.
 WITHIN = 2.0
@@ -47,6 +50,7 @@ class Shifts(NamedTuple):
     log_b: np.ndarray  # (K,) log10 of b_T; 0 without vertical shifts
     log_b_errors: np.ndarray
     misfit: np.ndarray  # (K,) relative root mean square distance of each sweep from the curve
+    points: np.ndarray  # (K,) number of points of each sweep
     covariance: np.ndarray  # (K, K) of `log_a`; errors of neighbouring sweeps are correlated
     knots: float  # distance between two knots of the curve [decades]
     given: bool = False
@@ -55,7 +59,7 @@ class Shifts(NamedTuple):
     @property
     def apart(self) -> float:
         """Relative root mean square distance of all points from the curve."""
-        return float(np.sqrt(np.mean(self.misfit**2)))
+        return float(np.sqrt(np.average(self.misfit**2, weights=self.points)))
 
 
 def found(
@@ -96,9 +100,13 @@ def _in_decades(sweeps: Sequence[Sweep]) -> list[tuple[np.ndarray, np.ndarray, n
     return [(np.log10(s.angular_frequency), np.log10(s.storage), np.log10(s.loss)) for s in sweeps]
 
 
-def sum_of_squares(sweeps: Sequence[Sweep], shifts: Shifts) -> float:
+def _points_of(sweeps: Sequence[Sweep]) -> np.ndarray:
+    return np.array([len(s.storage) for s in sweeps])
+
+
+def sum_of_squares(shifts: Shifts) -> float:
     """Return the sum of the squares of the relative distances of all G' and G'' from the curve."""
-    return float(np.array([2 * len(s.storage) for s in sweeps]) @ shifts.misfit**2)
+    return float(2 * shifts.points @ shifts.misfit**2)
 
 
 def _best(sweeps: Sequence[Sweep], every: list[Shifts], factors: int) -> Shifts:
@@ -113,7 +121,7 @@ def _best(sweeps: Sequence[Sweep], every: list[Shifts], factors: int) -> Shifts:
         numbers = 2 * size_of_curve(sweeps, own.log_a, own.knots) + factors + 1 + differ
         if data < numbers + 2:
             return np.inf
-        squares = _squares_of_moduli(sweeps, own) if differ else np.array([sum_of_squares(sweeps, own) / data])
+        squares = _squares_of_moduli(sweeps, own) if differ else np.array([sum_of_squares(own) / data])
         fit = data * float(np.mean(np.log(np.maximum(squares, least))))
         return fit + 2 * numbers * (1 + (numbers + 1) / (data - numbers - 1))
 
@@ -142,7 +150,8 @@ def _at_knots(
         free: whether each log a and each log b is fitted (2, K).
         knots: distance between two knots [decades].
     """
-    columns, points = _in_decades(sweeps), sum(len(s.storage) for s in sweeps)
+    columns, counts = _in_decades(sweeps), _points_of(sweeps)
+    points = int(counts.sum())
     log_a, log_b, weights = *first, np.ones(2)
     for _ in range(ROUNDS):
         log_a, log_b, A, b = _by_gauss_newton(columns, (log_a, log_b), free, knots, weights)
@@ -151,13 +160,13 @@ def _at_knots(
         if settled:
             break
     covariance = np.zeros((2 * len(sweeps),) * 2)
-    found = _covariance(A, b, 2 * points)[: free.sum(), : free.sum()]
+    found = _covariance(A, b, counts)[: free.sum(), : free.sum()]
     covariance[np.ix_(free.ravel(), free.ravel())] = found
     spread = np.sqrt(np.diag(covariance)).reshape(2, -1)
     misfit = distances_from_curve(sweeps, log_a, log_b, knots)
     of_a = covariance[: len(sweeps), : len(sweeps)]
     found_weights = (float(weights[0]), float(weights[1]))
-    return Shifts(*at, log_a, spread[0], log_b, spread[1], misfit, of_a, knots, weights=found_weights)
+    return Shifts(*at, log_a, spread[0], log_b, spread[1], misfit, counts, of_a, knots, weights=found_weights)
 
 
 def _by_gauss_newton(
@@ -199,7 +208,7 @@ def known_shifts(sweeps: Sequence[Sweep], temperatures: np.ndarray, reference: i
     are the same as for `found`."""
     none, exact = np.zeros(len(sweeps)), np.zeros((len(sweeps),) * 2)
     every = [
-        Shifts(temperatures, reference, log_a, none, none, none, misfit, exact, knots, given=True)
+        Shifts(temperatures, reference, log_a, none, none, none, misfit, _points_of(sweeps), exact, knots, given=True)
         for knots in KNOTS
         for misfit in (distances_from_curve(sweeps, log_a, none, knots),)
     ]
@@ -296,11 +305,30 @@ def _linear_problem(
     return A, np.concatenate([*right, np.zeros(len(smooth))])
 
 
-def _covariance(A: np.ndarray, b: np.ndarray, data: int) -> np.ndarray:
-    """Return the covariance of all unknowns. The first `data` rows of A and b belong to the data; the other rows are
-    the penalty that keeps the curve smooth."""
-    inverse = np.linalg.pinv(A)[:, :data]
-    return inverse @ inverse.T * np.sum(b[:data] ** 2) / max(1, data - A.shape[1])
+def _covariance(A: np.ndarray, b: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return the covariance of all unknowns. The first rows of A and b belong to G' of all K sweeps, and the next rows
+    to G''. The other rows are the penalty that keeps the curve smooth. If the noise of the sweeps differs by more than
+    chance explains, each sweep has its own noise. `counts` (K,): number of points of each sweep."""
+    data, place = 2 * counts.sum(), np.tile(np.repeat(np.arange(len(counts)), counts), 2)
+    inverse, squares = np.linalg.pinv(A)[:, :data], b[:data] ** 2
+    leverages = np.einsum("nc,cn->n", A[:data], inverse)
+    degrees = 2 * counts - np.bincount(place, leverages)
+    variances = np.full(len(counts), np.sum(squares) / max(1, data - A.shape[1]))
+    known = degrees >= LEAST_DEGREES
+    own = np.bincount(place, squares)[known] / degrees[known]
+    if _differ(own, degrees[known]):
+        variances[known] = own
+    return inverse * variances[place] @ inverse.T
+
+
+def _differ(variances: np.ndarray, degrees: np.ndarray) -> bool:
+    """Return whether variances (k,) with the given degrees of freedom (k,) differ by more than chance explains (test of
+    Bartlett 1937)."""
+    if len(variances) < 2 or not variances.min() > 0:
+        return False
+    ratio = degrees.sum() * np.log(np.average(variances, weights=degrees)) - degrees @ np.log(variances)
+    correction = 1 + (np.sum(1 / degrees) - 1 / degrees.sum()) / (3 * (len(degrees) - 1))
+    return bool(chdtrc(len(degrees) - 1, ratio / correction) < CHANCE)
 
 
 def _first_shifts(columns: list, temperatures: np.ndarray, reference: int) -> np.ndarray:
@@ -330,10 +358,11 @@ def _over(fixed: tuple, moving: tuple) -> float | None:
     """
     best, where = (np.inf, 0), None
     noise = WITHIN * sum(_variance(c) for c in (fixed, moving))
-    for s in REACH:
-        x = moving[0] + s
-        inside = (x >= fixed[0][0] - 1e-9) & (x <= fixed[0][-1] + 1e-9)
-        if inside.sum() < max(2, OVERLAP * len(x)):
+    places = [moving[0] + s for s in REACH]
+    insides = [(x >= fixed[0][0] - 1e-9) & (x <= fixed[0][-1] + 1e-9) for x in places]
+    least = max(2, OVERLAP * max(inside.sum() for inside in insides))
+    for s, x, inside in zip(REACH, places, insides, strict=True):
+        if inside.sum() < least:
             continue
         apart = [moving[j][inside] - np.interp(x[inside], fixed[0], fixed[j]) for j in (1, 2)]
         score = max(float(np.mean(np.square(apart))), noise), -int(inside.sum())

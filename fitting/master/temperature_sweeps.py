@@ -49,10 +49,23 @@ def read_temperatures(paths: Sequence[Path]) -> AtTemperatures:
             f"{celsius(parts[0][0]):.4g} °C (rows less than {SAME:g} K apart count as one temperature); give a file "
             "with several tables, or several files"
         )
-    factors = np.array([float(np.exp(np.mean([np.log(p[1]) for p in g]))) for g in groups])
+    factors = np.array([_mean_factor(np.array([p[1] for p in g])) for g in groups])
     means = np.array([float(np.mean([p[0] for p in g])) for g in groups])
-    known = np.isfinite(factors).all()
-    return AtTemperatures([joined([p[2] for p in g]) for g in groups], means, factors if known else None)
+    sweeps, known = [joined([p[2] for p in g]) for g in groups], np.isfinite(factors)
+    if known.any() and not known.all():
+        without = ", ".join(f"{T:.4g}" for T in celsius(means[~known]))
+        note = (
+            f"the given values of shift_factor are not used, and all factors are fitted, because the factor at "
+            f"{without} °C is missing: give a factor at every temperature"
+        )
+        sweeps[0] = sweeps[0]._replace(notes=(*sweeps[0].notes, note))
+    return AtTemperatures(sweeps, means, factors if known.all() else None)
+
+
+def _mean_factor(factors: np.ndarray) -> float:
+    """Return the geometric mean of the shift factors (n,). NaN values are ignored; the result is NaN if all are NaN."""
+    given = factors[np.isfinite(factors)]
+    return float(np.exp(np.mean(np.log(given)))) if len(given) else np.nan
 
 
 def _index_of_group(T: np.ndarray, exact: bool) -> np.ndarray:
@@ -71,17 +84,22 @@ def _index_of_group(T: np.ndarray, exact: bool) -> np.ndarray:
 
 
 def joined(sweeps: Sequence[Sweep]) -> Sweep:
-    """Return one sweep with all points of several sweeps, sorted by frequency."""
+    """Return one sweep with all points of several sweeps, sorted by frequency. It has standard deviations if all
+    sweeps have them."""
     omega = np.concatenate([s.angular_frequency for s in sweeps])
     order = np.argsort(omega, kind="stable")
     storage, loss = (np.concatenate([getattr(s, q) for s in sweeps])[order] for q in ("storage", "loss"))
     storage_sd = loss_sd = None
-    if all(s.storage_sd is not None and s.loss_sd is not None for s in sweeps):
+    notes = [note for s in sweeps for note in s.notes]
+    given = [s.storage_sd is not None and s.loss_sd is not None for s in sweeps]
+    if any(given) and not all(given):
+        notes.append("the standard deviations are not used, because some of the sweeps have none: give them for all")
+    if all(given):
         storage_sd, loss_sd = (
             np.concatenate([getattr(s, q) for s in sweeps])[order] for q in ("storage_sd", "loss_sd")
         )
-    notes = tuple(dict.fromkeys(note for s in sweeps for note in s.notes))
-    return Sweep(omega[order], storage, loss, storage_sd, loss_sd, source=sweeps[0].source, notes=notes)
+    told = tuple(dict.fromkeys(notes))
+    return Sweep(omega[order], storage, loss, storage_sd, loss_sd, source=sweeps[0].source, notes=told)
 
 
 def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, float, Sweep]]:
@@ -115,7 +133,7 @@ def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, flo
     out = []
     for k in range(group.max() + 1):
         mine = group == k
-        factor = float(np.exp(np.mean(np.log(factors[mine]))))
+        factor = _mean_factor(factors[mine])
         own = some(sweep, mine)
         repeated = len(own.angular_frequency) - len(np.unique(own.angular_frequency))
         if repeated and group.max() > 0:

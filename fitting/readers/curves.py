@@ -111,7 +111,7 @@ def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[
         notes += [
             f"{file.name}: data row {k} is a summary of other rows ({own}) and is ignored" for k, own in summaries
         ]
-        rows, left_out = _measured_rows(rows)
+        rows, left_out = _measured_rows(file, rows)
         notes += [f"{file.name}: {left_out} rows without a stress are ignored"] if left_out else []
         spreads = [name for name in rows[0] if _SPREAD.search(name)]
         if spreads:
@@ -188,11 +188,11 @@ def _rows_of_curves(file: Path) -> tuple[list[dict[str, str]], list[tuple[int, s
     return rows, [(k + 1, own) for k, own in summaries.items()]
 
 
-def _measured_rows(rows: list[dict[str, str]]) -> tuple[list[dict[str, str]], int]:
+def _measured_rows(file: Path, rows: list[dict[str, str]]) -> tuple[list[dict[str, str]], int]:
     """Return the rows with a measured nominal stress, and the number of rows without it. If no row has a nominal
     stress, return all rows and 0."""
-    name = next((key for key in rows[0] if key.startswith("nominal_stress")), None)
-    kept = rows if name is None else [row for row in rows if row[name].lower() not in EMPTY]
+    column = _stress_column(file, rows[0], "nominal_stress", "Pa")
+    kept = rows if column is None else [row for row in rows if row[column[0]].lower() not in EMPTY]
     return (kept, len(rows) - len(kept)) if kept else (rows, 0)
 
 

@@ -223,11 +223,26 @@ def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 40) -> tuple[np.
     _, near = cKDTree(X[tets].mean(axis=1)).query(points, k=candidates)
     near = near.reshape(len(points), candidates)
     D = np.moveaxis(np.asarray(mesh.shape_vectors), -1, 0)  # (E, 3, 3) gradients of shape functions 1 to 3
-    inner = np.einsum("nkac,nkc->nka", D[near], points[:, None] - X[tets[near, 0]])
-    bary = np.concatenate([1 - inner.sum(axis=-1, keepdims=True), inner], axis=-1)
+
+    def barycentric(element: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return the barycentric coordinates (…, 4) of points (…, 3) in elements (…)."""
+        inner = np.einsum("...ac,...c->...a", D[element], points - X[tets[element, 0]])
+        return np.concatenate([1 - inner.sum(axis=-1, keepdims=True), inner], axis=-1)
+
+    bary = barycentric(near, points[:, None])
     best = np.argmax(bary.min(axis=-1), axis=1)
     row = np.arange(len(points))
     element, weights = near[row, best], bary[row, best]
+    # If the sizes of the elements differ much, the right element may have none of the nearest centres. So all elements
+    # whose bounding box, enlarged by a tenth, contains the point are searched too.
+    low, high = X[tets].min(axis=1), X[tets].max(axis=1)
+    low, high = low - 0.1 * (high - low), high + 0.1 * (high - low)
+    for k in np.flatnonzero(weights.min(axis=-1) < 0):
+        boxed = np.flatnonzero(np.all((low <= points[k]) & (points[k] <= high), axis=1))
+        own = barycentric(boxed, points[k])
+        if np.max(own.min(axis=-1), initial=-np.inf) > weights[k].min():
+            nearest = int(np.argmax(own.min(axis=-1)))
+            element[k], weights[k] = boxed[nearest], own[nearest]
     outside = np.maximum(0.0, -weights.min(axis=-1))
     if mesh.order == 1:
         return tets[element], weights, outside

@@ -27,8 +27,8 @@ def column_in_si(path: str, column: Column, written: np.ndarray, notes: list[str
         if quantity == "phase":
             if np.nanmax(written) <= 0.5 * np.pi:
                 raise InputError(
-                    f"{path}: column {column.name} may be in degrees or radians; name this column phase_deg or "
-                    "phase_rad"
+                    f"{path}: column {column.name} may be in degrees or radians; name this column "
+                    f"{column.quantity}_deg or {column.quantity}_rad"
                 )
             unit = "deg"
         notes.append(f"column {column.name!r} states no unit; {unit} is assumed")

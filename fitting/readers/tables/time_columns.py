@@ -188,7 +188,7 @@ def _of_shear(columns: dict[str, np.ndarray], notes: list[str]) -> tuple[dict[st
         verb = "is assumed to be that" if len(tensile) == 1 else "are assumed to be those"
         notes = [*notes, f"{' and '.join(tensile)} {verb} of an incompressible sample: G = E / 3"]
     if "tensile stress" in tensile:
-        notes += beyond_small(float(np.nanmax(np.abs(columns["strain"]))))
+        notes += beyond_small(float(np.nanmax(np.abs(columns["strain"]), initial=0.0)))
     return columns, notes
 
 
