@@ -14,6 +14,7 @@ from liverjax.core import status
 from liverjax.core.struct import replace
 from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.physics.contact.pressed import PressedObstacle
+from liverjax.scenes.checks.choices import check_choices
 from liverjax.simulation import cautions
 from liverjax.simulation.cautions import cautions_of_mesh, cautions_of_run, mesh_sentence
 from liverjax.simulation.mesh_error import MeshError
@@ -404,3 +405,23 @@ def test_a_body_whose_estimate_is_not_found_is_not_said_to_be_at_rest():
     assert "the body does not move" in mesh_sentence(scene(BOX), replace(result, mesh_error=nothing))
     failed = replace(result, status=np.array([status.NOT_FINITE]))
     assert mesh_sentence(scene(BOX), failed).startswith("the mesh error is unknown, because the last step failed")
+
+
+def test_quadratic_elements_that_cannot_have_pressures_are_told_that_they_lock():
+    """With volumetric = "auto" nothing was said. With "element" the advice was a setting that is refused here."""
+    stiff = replace(scene(lj.quadratic(BOX), volumetric="auto"), law=lj.laws.NeoHookean(mu=770.0, bulk=770000.0))
+    viscosity = lj.Prony(ratios=jnp.array([0.3]), relaxation_times=jnp.array([0.1]))
+    assert cautions.of_locking(stiff) == []  # "auto" chooses "mixed"
+    for volumetric in ("auto", "element"):
+        viscous = replace(stiff, viscosity=viscosity, solve=lj.Solve(volumetric=volumetric))
+        (said,) = cautions.of_locking(viscous)
+        assert said.endswith("write volumetric = 'mixed' in [solve] and part = 'isochoric' in [viscosity]")
+    followed = replace(viscosity, part="isochoric")
+    check_choices(replace(stiff, viscosity=followed, solve=lj.Solve(volumetric="mixed")))
+    springpots = lj.SpringpotSeries(times=jnp.array([0.01]), exponents=jnp.array([0.3]))
+    waves = replace(
+        stiff, springpots=springpots, solve=lj.Solve(kind="harmonic", frequencies=[60.0], volumetric="auto")
+    )
+    assert cautions.of_locking(waves)[0].endswith("part = 'isochoric' in [springpots]")
+    continued = replace(stiff, law=lj.laws.continued(stiff.law, 0.1))
+    assert cautions.of_locking(continued)[0].endswith("too stiff: use a finer mesh")

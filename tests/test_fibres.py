@@ -145,3 +145,11 @@ def test_a_fibre_without_length_is_refused():
         for own in (law, law + lj.laws.NeoHookean(mu=100.0, bulk=None)):
             with pytest.raises(lj.InputError, match="law Holzapfel has a fibre of length 0"):
                 lj.simulate(lj.Scene(mesh=mesh, law=own, fixed=(lj.Fixed(nodes=mesh.node_sets["z_min"]),)))
+
+
+def test_the_same_fibre_law_twice_is_twice_the_law():
+    """A sum with the same object twice once raised KeyError."""
+    law = Holzapfel(mu=500.0, k1=100.0, k2=2.0, bulk=5000.0, fibre=(1.0, 0.2, 0.0))
+    F = jnp.eye(3) + 0.1 * jnp.asarray(np.random.default_rng(1).standard_normal((3, 3)))
+    assert np.allclose((law + law).first_piola(F), 2 * law.first_piola(F), rtol=1e-12)
+    assert np.allclose((law + law).tangent(F), 2 * law.tangent(F), rtol=1e-12)

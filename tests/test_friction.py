@@ -1,5 +1,6 @@
 """Coulomb friction at rigid obstacles: a block on an incline, its tangent, derivatives, invalid input."""
 
+from functools import partial
 from types import SimpleNamespace
 
 import jax
@@ -10,7 +11,7 @@ import pytest
 import liverjax as lj
 from liverjax.core import status
 from liverjax.core.errors import InputError
-from liverjax.core.struct import replace
+from liverjax.core.struct import in_precision, replace
 from liverjax.mesh.nodal import nodal_volumes
 from liverjax.physics.base import Free, Step
 from liverjax.physics.contact.friction import RoughObstacle
@@ -177,3 +178,17 @@ def test_bad_friction_is_one_sentence():
         scene_from(scene | {"obstacle": [table | {"friction": 0.0}]})
     with pytest.raises(InputError, match=r"obstacle\.0\.friction = -0\.1"):
         scene_from(scene | {"obstacle": [table | {"friction": -0.1}]})
+
+
+def test_a_point_that_has_not_moved_has_derivatives():
+    """In single precision, the reverse-mode derivatives of the slip were NaN at a point without any slip."""
+    scene, dtype = block(0.3), jnp.float32
+    mesh = jax.tree.map(partial(in_precision, dtype=dtype), scene.mesh)
+    (rough,) = jax.tree.map(partial(in_precision, dtype=dtype), scene.physics)
+    x = mesh.points - jnp.array([[0.0, 0.0, 1e-3]], dtype)
+    one = jnp.ones((), dtype)
+    acting = rough.freeze(None, Step(mesh, x, 1, 1, one, True, None, Free(jnp.ones_like(x))))
+    _, back = jax.vjp(lambda at: acting.slip_at(at, one), acting.points(x))
+    (slope,) = back(jnp.ones_like(acting.past))
+    # A point that sticks keeps its whole motion along the plane.
+    assert slope.dtype == dtype and np.array_equal(slope[:2], np.ones(slope[:2].shape)) and not np.any(slope[2])

@@ -149,3 +149,20 @@ def test_the_stress_at_the_start_relaxes_from_its_first_moment(order, part, tau)
     rest = mjed.internal_force(mesh, law.volumetric_part(), mesh.points + by) if part == "isochoric" else 0.0
     exact = left[:, None, None] * np.asarray(whole)[None] + np.asarray(rest)
     assert np.allclose(found.reactions, exact, rtol=1e-9, atol=1e-12 * np.abs(exact).max())
+
+
+def test_no_stress_has_relaxed_and_no_fluid_has_flowed_in_the_first_acceleration():
+    """The stress and the pressures after a whole first step were once used."""
+    scene = _let_go()
+    start, top = _stretched(scene, 0.1), jnp.asarray(scene.mesh.node_sets["z_max"])
+
+    @jax.jit
+    def first(permeability: float, ratio: float) -> jax.Array:
+        wet = {"permeability": permeability, "initial_pressure": 50.0, "drained": top}
+        porous = lj.Porosity(bulk=400.0, limit_bulk=2200.0, fluid_fraction=0.5, **wet)
+        viscous = lj.Prony(ratios=jnp.array([ratio]), relaxation_times=jnp.array([0.01]))
+        state = initial_state(replace(scene, porosity=porous, viscosity=viscous), start)
+        return next(m for m in state.memories if isinstance(m, Motion)).acceleration
+
+    found, expected = first(1e-4, 0.8), first(0.0, 0.0)
+    assert np.allclose(found, expected, rtol=1e-10, atol=1e-10 * float(jnp.abs(expected).max()))

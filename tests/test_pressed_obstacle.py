@@ -1,5 +1,8 @@
 """Obstacles under a force: a bar by hand, the body under the displacement that was found, unloading, derivatives."""
 
+from functools import partial
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +15,7 @@ from liverjax.physics.base import Step
 from liverjax.physics.contact.obstacle import Obstacle, contact_force, largest_depth
 from liverjax.physics.contact.pressed import PressedObstacle
 from liverjax.scenes.scene_file import scene_from
+from liverjax.simulation import cautions, run
 from liverjax.simulation.cautions import cautions_of_run
 
 pytestmark = pytest.mark.quick_to_compile
@@ -256,3 +260,12 @@ def test_the_travel_of_a_pressed_obstacle_has_second_derivatives(shape):
     assert float(second(v)) == pytest.approx(exact, rel=1e-5, abs=1e-9 * abs(away[0]) / h)
     if shape == "plane":  # without a load the plane just touches: 1 / (sum of the stiffness of its points)
         assert float(first(0.0)) == pytest.approx(away[0], rel=1e-9)
+
+
+def test_a_body_with_a_given_loaded_shape_is_unloaded_only_once():
+    """After the run, the reference points were unloaded once more. A caution uses the displacement of the obstacle."""
+    scene = cube(partial(plane, force=jnp.array([0.0, 0.0, -1e-3])), cells=(1, 1, 1), solve=lj.Solve(steps=1))
+    result = SimpleNamespace(positions=scene.mesh.points[None], times=np.ones(1))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run, "unload", None)  # a call would fail
+        assert cautions._of_contacts(replace(scene, points_are="loaded"), result) == []

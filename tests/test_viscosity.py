@@ -182,3 +182,11 @@ def test_coefficients_have_a_derivative_where_the_step_is_a_relaxation_time(numb
     h = 1e-20j * np.eye(2)[k]
     for derivative in (jax.jacfwd(found, k), jax.jacrev(found, k)):
         assert np.allclose(derivative(t, t), exact(t + h[0], t + h[1]).imag / 1e-20, rtol=1e-13)
+
+
+@pytest.mark.parametrize("scheme", ["exponential", "backward_euler"])
+def test_a_series_without_modes_relaxes_nothing(scheme):
+    """The backward Euler scheme once raised a TypeError here."""
+    prony = lj.Prony(ratios=[], relaxation_times=[], scheme=scheme)
+    found = viscosity.recall(prony, viscosity.initial_history(prony, 2), 0.1)
+    assert float(found.now) == 1.0 and np.array_equal(found.past, np.zeros((3, 3, 2)))

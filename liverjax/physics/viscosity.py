@@ -235,7 +235,8 @@ def recall(prony: Prony, history: History, dt: Array) -> Recall:
     a, b, c = coefficients(prony, dt)
     if a.ndim == 2:
         return _recall_by_element(a, b, c, history)
-    past: Any = sum(b[k] * history.gamma[k] for k in range(b.shape[0]))
+    modes = [b[k] * history.gamma[k] for k in range(b.shape[0])]
+    past: Any = sum(modes[1:], modes[0]) if modes else jnp.zeros(history.gamma.shape[1:], history.gamma.dtype)
     if history.stress is not None:
         past = past + jnp.sum(c) * history.stress
     return Recall(symmetric(tuple(past)), 1 - jnp.sum(a))

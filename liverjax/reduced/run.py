@@ -31,7 +31,6 @@ from liverjax.reduced.physics.fluid import (
     advanced_fluid,
     flowing,
     fluid_at_rest,
-    pressure_coordinates,
     reduced_sponge,
     volume_stress,
 )
@@ -158,10 +157,8 @@ def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
 def _forces_of_fluid(model: ReducedModel, scene: Scene, fluid: ReducedFluid) -> jax.Array:
     """Return the reduced forces (n,) [N m^-1.5] on the n modes due to a given initial pressure (see
     `liverjax.simulation.equations.initial_state`)."""
-    sponge = reduced_sponge(model, scene)
-    flow = flowing(model, sponge, fluid, jnp.asarray(scene.solve.dt))
-    p = pressure_coordinates(flow, flow.J)
-    return jnp.tensordot(model.weights[None] * volume_stress(model, sponge.porosity, p, fluid.F), model.slopes, axes=2)
+    stress = volume_stress(model, reduced_sponge(model, scene).porosity, fluid.pressure, fluid.F)
+    return jnp.tensordot(model.weights[None] * stress, model.slopes, axes=2)
 
 
 def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Callable:

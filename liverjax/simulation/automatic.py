@@ -120,11 +120,27 @@ def form_of_volumes(scene: Scene) -> str:
         return name
     if scene.mesh.order == 1:
         return "element"
+    return "mixed" if _allows_mixed(scene) else "element"
+
+
+def _allows_mixed(scene: Scene) -> bool:
+    """Return whether `volumetric` can be "mixed" in this scene."""
     try:
         check_choices(replace(scene, solve=replace(scene.solve, volumetric="mixed")))
     except InputError:
-        return "element"
-    return "mixed"
+        return False
+    return True
+
+
+def advice_against_locking(scene: Scene) -> str:
+    """Return the advice for quadratic elements that lock: volumetric = "mixed" if possible, otherwise a finer mesh."""
+    if _allows_mixed(scene):
+        return "write volumetric = 'mixed' in [solve]"
+    for key in ("viscosity", "springpots"):
+        own = getattr(scene, key)
+        if own is not None and _allows_mixed(replace(scene, **{key: replace(own, part="isochoric")})):
+            return f"write volumetric = 'mixed' in [solve] and part = 'isochoric' in [{key}]"
+    return "use a finer mesh"
 
 
 def thinnest(points: np.ndarray, tetrahedra: np.ndarray, volumes: np.ndarray) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from liverjax.core import status
 from liverjax.core.compiled import compiled
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Number
+from liverjax.core.struct import Number, replace
 from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.locate import doubled_vertices, hanging_vertices
 from liverjax.mesh.tetrahedra import TetMesh
@@ -29,7 +29,7 @@ from liverjax.scenes.by_element import by_element
 from liverjax.scenes.checks.histories import cautions_of_histories
 from liverjax.scenes.checks.rigid_motion import loose_piece
 from liverjax.scenes.scene import Scene, histories, named_physics
-from liverjax.simulation.automatic import qualities
+from liverjax.simulation.automatic import advice_against_locking, form_of_volumes, qualities
 from liverjax.simulation.obstacle_forces import obstacle_forces
 from liverjax.simulation.run import Result
 from liverjax.simulation.unloaded import cautions_of_loaded
@@ -51,7 +51,7 @@ def cautions_of_run(scene: Scene, result: Result) -> list[str]:
     """Return warnings about the mesh, the loads, the contacts and the volumes of a run. The list may be empty.
 
     Args:
-        scene: a `Scene` with known numbers (not inside jit, grad or vmap).
+        scene: a `Scene` with known numbers (not inside jit, grad or vmap). Its points are the reference points.
         result: `Result` of its run.
     """
     return [
@@ -158,8 +158,8 @@ _LOCKING = 100.0
 
 
 def of_locking(scene: Scene) -> list[str]:
-    """Warn if quadratic elements are too stiff (lock). With volumetric = "mixed" these elements would not lock."""
-    if scene.mesh.order == 1 or scene.solve.volumetric != "element" or scene.porosity is not None:
+    """Warn if quadratic elements are too stiff (lock). With volumetric = "mixed" they would not lock."""
+    if scene.mesh.order == 1 or form_of_volumes(scene) != "element" or scene.porosity is not None:
         return []
     try:
         laws = regions.laws_of(scene.law, scene.region)
@@ -170,7 +170,7 @@ def of_locking(scene: Scene) -> list[str]:
         return []
     return [
         f"the bulk modulus is {ratio:.3g} times the shear modulus, so these quadratic elements are too stiff: "
-        "write volumetric = 'mixed' in [solve]"
+        f"{advice_against_locking(scene)}"
     ]
 
 
@@ -266,7 +266,7 @@ def _of_contacts(scene: Scene, result: Result) -> list[str]:
     said, steps = [], len(result.times)
     obstacles = [(name, physics) for name, physics in named_physics(scene) if isinstance(physics, Obstacle)]
     pressed = any(isinstance(physics, PressedObstacle) for _, physics in obstacles)
-    found = obstacle_forces(scene, result).displacement if pressed else None
+    found = obstacle_forces(replace(scene, points_are="reference"), result).displacement if pressed else None
     for number, (name, physics) in enumerate(obstacles):
         if physics.shape == "plane":
             continue

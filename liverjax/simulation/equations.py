@@ -17,6 +17,7 @@ from liverjax.mesh.promotion import on_middles
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End, Free, NodalForce, Physics, Solid, Start, Step, VolumeStress
 from liverjax.physics.darcy import Guess
+from liverjax.physics.inertia import Inertia
 from liverjax.physics.prescribed import free_degrees, given_acceleration, prescribed
 from liverjax.physics.registry import law_at_rest, physics_of
 from liverjax.scenes.scene import Scene
@@ -131,10 +132,12 @@ def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
 def _forces_at_beginning(scene: Scene, x: jax.Array) -> jax.Array:
     """Return the forces (V, 3) [N] of all physics at positions x (V, 3), with the internal variables of a body at rest.
 
-    Inertia and the forces that act only at the end of a step (`NodalForce.at_end`) are omitted.
+    Inertia and the forces that act only at the end of a step (`NodalForce.at_end`) are omitted. No time has passed, so
+    no stress has relaxed and no fluid has flowed.
     """
-    still = replace(scene, solve=replace(scene.solve, kind="static"))
     none = jnp.zeros((), x.dtype)
+    scene = replace(scene, viscosity=None, solve=replace(scene.solve, dt=none))
+    still = replace(scene, solve=replace(scene.solve, kind="static"))
     at_rest = initial_state(still)._replace(x=x)
     e = _of_physics(scene, physics_of(still), at_rest, jnp.ones((), x.dtype), Sizes(none, none))
     q = unknowns(e, x)
@@ -157,9 +160,10 @@ def _with_tied(physics: tuple[Physics, ...], step: Step) -> Step:
 def _prescribed_acceleration(scene: Scene, physics: tuple[Physics, ...], step: Step) -> jax.Array | None:
     """Return the prescribed acceleration (V, 3) [m/s^2] at the end of a step of Newmark's method; 0 for free motion.
 
-    Return None if no motion is prescribed, or for other methods, which do not need this acceleration.
+    Return None if no motion is prescribed, or for other methods, which do not need this acceleration. Also return None
+    if `physics` has no inertia.
     """
-    if not step.averaged:
+    if not step.averaged or not any(isinstance(p, Inertia) for p in physics):
         return None
     if not scene.displaced and not any(nodes.linear for nodes in _with_tied(physics, step).free.tied):
         return None

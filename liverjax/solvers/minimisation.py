@@ -134,7 +134,7 @@ def _descend(problem: Problem, options: StepOptions, c: _Descent) -> _Descent:
     if not problem.symmetric or _potential(problem).settled is not None:
         definite = definite | (c.relative > _NEAR)
     K = _potential(problem).definite(c.q, one, c.by, None, definite)
-    goal = 0.3 * options.tolerance / jnp.maximum(c.relative, 1e-300)
+    goal = 0.3 * options.tolerance / jnp.maximum(c.relative, jnp.finfo(c.relative.dtype).tiny)
     forcing = jnp.clip(jnp.minimum(LINEAR_TOLERANCE, jnp.sqrt(c.relative)), jnp.minimum(goal, 0.5), 0.5)
     if _potential(problem).settled is not None:
         loose = definite & _potential(problem).eliminates

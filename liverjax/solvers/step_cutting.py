@@ -418,7 +418,7 @@ def _iterate(problem: Problem, options: StepOptions, start: jax.Array, c: _Point
     # The linear solve is not more accurate than is useful (Eisenstat and Walker 1996) or than the tolerance requires.
     ratio = size / jnp.where(c.aim > 0, c.aim, 1.0)
     reach = 0.3 * jnp.where(renew, ratio**2, ratio)
-    goal = 0.3 * options.tolerance / jnp.maximum(relative, 1e-300)
+    goal = 0.3 * options.tolerance / jnp.maximum(relative, jnp.finfo(relative.dtype).tiny)
     forcing = jnp.where(v.launch_now, LINEAR_TOLERANCE, jnp.maximum(reach, jnp.maximum(goal, 1e-12)))
     forcing = jnp.minimum(forcing, LINEAR_TOLERANCE)
     at = (trial, s, by)

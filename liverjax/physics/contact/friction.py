@@ -185,8 +185,12 @@ class Rubbing(Touching):
 
 
 def _of_slip(trial: jax.Array) -> jax.Array:
-    """Return the lengths (Q, m) [m] of slips (3, Q, m). They are at least 1e-100, to avoid a division by 0."""
-    return jnp.sqrt(jnp.maximum(jnp.sum(trial * trial, axis=0), 1e-200))
+    """Return the lengths (Q, m) [m] of slips (3, Q, m). They are at least 1e-103, in single precision 2e-13.
+
+    The bound avoids a division by 0. The lengths to the power -3, which occur in second derivatives, do not overflow.
+    """
+    least = float(jnp.finfo(trial.dtype).tiny) ** (2 / 3)
+    return jnp.sqrt(jnp.maximum(jnp.sum(trial * trial, axis=0), least))
 
 
 def _planes(n: jax.Array) -> jax.Array:

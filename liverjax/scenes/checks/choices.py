@@ -105,7 +105,7 @@ def _own_volumes(scene: Scene) -> None:
                 f"{name} needs a law with separate isochoric and volumetric energies, unlike {type(law).__name__}: use "
                 "another law, or volumetric = 'element'"
             )
-    if scene.viscosity is not None and scene.viscosity.part != "isochoric":
+    if any(own is not None and own.part != "isochoric" for own in (scene.viscosity, scene.springpots)):
         raise InputError(
             f"{name} needs a volumetric stress that does not relax: use part = 'isochoric' in [viscosity] or "
             "[springpots]"
