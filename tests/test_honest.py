@@ -278,20 +278,24 @@ def test_the_total_error_has_every_share(tmp_path):
     assert shares["geometry"]["ratios"] == [0, 0, 0] == shares["geometry"]["relaxation_times"]
     assert shares["noise"] == content["standard_errors"]
     change = content["band_sensitivity"]["without_last_half_decade"]["shear_modulus"]
+    ends = [w for w in content["warnings"] if "half decade changes" in w]
     beyond = np.sqrt(change**2 - content["standard_errors"]["shear_modulus"] ** 2)
     assert shares["band"]["shear_modulus"] == pytest.approx(beyond)
     square = sum(part["shear_modulus"] ** 2 for part in shares.values())
     assert total["shear_modulus"] == pytest.approx(np.sqrt(square))
     main([*args, "--gap-error", "1e-3", "--out", str(tmp_path)])
     told = json.loads((tmp_path / "fit.json").read_text())
-    # the error of the gap is in the noise
-    assert told["error_shares"]["geometry"]["shear_modulus"] == pytest.approx(0.01 * G0)
-    assert told["standard_errors"]["shear_modulus"] > 0.1 * G0
-    # Leaving out the last half decade changes G0 by less than this error. So the table has no star, and there is no
-    # warning.
-    assert abs(change) < told["standard_errors"]["shear_modulus"]
-    ends = [w for w in told["warnings"] if "half decade changes" in w]
-    assert len(ends) == 1 and "relaxation_times" in ends[0] and "modulus" not in ends[0]
+    # The error of the gap replaces the usual 50 um. It explains no change at the ends of the band. It was in the noise,
+    # so the total error of G0 was smaller, and the warning about G0 was lost.
+    assert told["error_shares"]["geometry"]["shear_modulus"] == pytest.approx(np.hypot(1e-3 / 9.2e-3, 0.01) * G0)
+    assert (
+        abs(change) < told["standard_errors"]["shear_modulus"] and told["standard_errors"]["shear_modulus"] > 0.1 * G0
+    )
+    for source in ("noise", "band"):
+        assert told["error_shares"][source]["shear_modulus"] == pytest.approx(shares[source]["shear_modulus"])
+    assert [w for w in told["warnings"] if "half decade changes" in w] == ends and "modulus" in ends[0]
+    long = [c["error_shares"]["long_times"]["equilibrium_modulus"] for c in (content, told)]
+    assert long[1] == pytest.approx(long[0])
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import json
 
+import h5py
 import numpy as np
 import pytest
 import scipy.optimize
@@ -11,8 +12,10 @@ from fitting.fits import instrument, simulated_rheometer, viscoelastic
 from fitting.methods import generalised_maxwell, uncertainty
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.frequency_sweep import Sweep
+from fitting.reports import sweep_report
 from fitting.rigs import compression
 from liverjax import laws
+from liverjax.core.plotting import pyplot
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -299,6 +302,23 @@ def test_a_profile_has_the_error_of_the_gap_and_of_the_inertia(gap, share):
         assert end - fit.uncertainty.values[0] == pytest.approx(exact, rel=0.02), (end, exact)
 
 
+def test_weights_are_no_standard_deviations_of_the_data(tmp_path):
+    """For a sweep without standard deviations, fit.png showed bars of 100 %, and fit.h5 contained these weights. The
+    run time was that of the last fit alone.
+    """
+    s = sweep(0.0, 0)._replace(inertia=None, friction=FRICTION, friction_error=2e-7)
+    start = viscoelastic.closed_form(s, 2)._replace(run_time=100.0)
+    fit, better = instrument.without_error_of_inertia(start, s)
+    assert better.sd_before and fit.run_time > 100
+    sweep_report.write(tmp_path, better, [fit], None)
+    with h5py.File(tmp_path / "fit.h5") as file:
+        assert set(file["data"]) == {"angular_frequency", "storage", "loss"}
+    (top, rest), known = pyplot().figure().subplots(2, 1), better._replace(sd_before=False)
+    for data, label in ((better, "G' measured"), (known, "G' measured ± sd")):
+        sweep_report.draw_moduli(top, rest, data, [fit])
+        assert top.get_legend_handles_labels()[1].count(label) == 1
+
+
 def test_the_command_widens_the_errors_by_the_gap(tmp_path, capsys):
     s = sweep(0.0, 0)
     head = "angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa"
@@ -307,7 +327,10 @@ def test_the_command_widens_the_errors_by_the_gap(tmp_path, capsys):
     errors = []
     for more in ([], ["--gap-error", "4e-4"]):
         assert main([*plain, *more, "--out", str(tmp_path)]) == 0
-        errors.append(json.loads((tmp_path / "fit.json").read_text())["standard_errors"])
+        content = json.loads((tmp_path / "fit.json").read_text())
+        errors.append(content["standard_errors"])
+    low, high = content["equilibrium_modulus_interval_95"]  # it did not contain the error of the gap
+    assert (high - low) / 2 == pytest.approx(1.96 * errors[1]["equilibrium_modulus"], rel=0.05)
     assert errors[1]["shear_modulus"] == pytest.approx(np.hypot(errors[0]["shear_modulus"], 80), rel=0.02)
     assert errors[1]["equilibrium_modulus"] == pytest.approx(np.hypot(errors[0]["equilibrium_modulus"], 32), rel=0.05)
     assert errors[1]["ratios"] == pytest.approx(errors[0]["ratios"])

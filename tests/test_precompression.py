@@ -223,6 +223,7 @@ def test_glued_plates_that_fold_the_sample_are_refused(law):
         (["--precompression", "5"], "give e.g. --precompression 0.05"),
         (["--precompression", "-0.1"], "from 0 to 0.5"),
         (["--precompression", "0.1", "--samples", "1000"], "remove --samples"),
+        (["--precompression", "0.1", "--predict", "other.csv"], "remove --predict"),
         (["--precompression", "0.1", "--model", "fractional"], "needs --method closed-form"),
         (["--precompression", "0.1", "--profile"], "remove --profile"),
         (["--precompression", "0.1", "--law", "costa"], "isotropic law"),

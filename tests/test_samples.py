@@ -12,8 +12,11 @@ from conftest import SHARED
 from fitting.__main__ import main
 from fitting.fits import samples
 from fitting.fits.samples import outliers
+from fitting.methods import generalised_maxwell
+from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.population import population
 from fitting.readers.frequency_sweep import Sweep
+from fitting.reports import samples_report
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -173,11 +176,37 @@ def test_the_order_of_the_samples_does_not_change_the_population():
     assert found[0] > 50 and np.isclose(*found)
 
 
+def test_a_typical_sample_has_the_mean_equilibrium_modulus():
+    """All samples have 30 Pa. The means of their ratios left 143 Pa, without a message."""
+    omega, rng, sweeps = np.geomspace(0.1, 100, 16), np.random.default_rng(0), []
+    for ratios in ((0.75, 0.22), (0.25, 0.72), (0.7, 0.27), (0.3, 0.67)):
+        G = generalised_maxwell.moduli(Maxwell(np.float64(1000.0), np.array(ratios), np.array([2.0, 0.05])), omega)
+        storage, loss = np.array(G) * (1 + 0.003 * rng.standard_normal((2, 16)))
+        sweeps.append(Sweep(omega, storage, loss, source=f"s{len(sweeps)}.csv"))
+    found = samples.fit(sweeps, "prony", 2)
+    mean = found.populations["equilibrium_modulus"].mean
+    assert float(found.typical.equilibrium_modulus) == pytest.approx(mean) == pytest.approx(30, rel=0.03)
+    assert not any("population mean" in w for w in samples_report.warnings(found))
+    other = found._replace(typical=found.typical._replace(ratios=found.typical.ratios * 0.9))
+    assert any("use the values of the population" in w for w in samples_report.warnings(other))
+
+
+def test_an_exponent_of_a_new_sample_is_at_most_one(monkeypatch):
+    """The interval of a new sample reached 1.9."""
+    monkeypatch.setattr(samples, "values_of_sample", lambda fit: fit)
+    rows = [{"springpot": (a * 1e3, 1.0), "slow_exponent": (a, 0.01)} for a in (0.6, 0.95, 0.7)]
+    found = samples._populations(rows)
+    assert found["slow_exponent"].new_interval[1] == 1 < found["springpot"].new_interval[1] / 1e3
+
+
 def test_a_sample_of_two_frequencies_allows_the_small_models():
     """The lists of models had different lengths, which raised an error of `zip`."""
     sweeps = [solid(100.0, np.geomspace(0.1, 100, n), n) for n in (8, 2)]
     found = samples.fit(sweeps, "fractional")
     assert {row["model"] for row in found.compared} == {"springpot", "fractional_kelvin_voigt"}
+    # The advice was "try fewer modes", which the program refuses for springpots.
+    failed = found._replace(fits=[fit._replace(converged=False) for fit in found.fits])
+    assert any("did not converge" in w and "try another --model" in w for w in samples_report.warnings(failed))
 
 
 def samples_of(rows):

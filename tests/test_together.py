@@ -265,7 +265,27 @@ def test_the_errors_are_those_of_the_stacked_rows(found):
 
 def test_tests_that_do_not_agree_are_named():
     told = together.fit([sweep(0.02), relaxation(0.005, 1.4)], 2).warnings
-    assert any("the tests do not agree" in w for w in told)
+    assert any("the tests do not agree" in w and "otherwise try more modes" in w for w in told)
+
+
+def test_tests_that_do_not_agree_in_a_spectrum_need_another_model():
+    """The advice was to try more modes, which the program refuses for --model spectrum."""
+    told = springpots_in_time.choose_together([sweep(0.02), relaxation(0.005, 1.4)], "spectrum").warnings
+    assert any("the tests do not agree" in w and "otherwise try another --model" in w for w in told)
+
+
+def test_shear_waves_of_several_tests_have_the_given_density(tmp_path):
+    """The density of water was used, although --density gave another one."""
+    G = generalised_maxwell.moduli(
+        TRUTH._replace(ratios=TRUTH.ratios[1:], relaxation_times=TRUTH.relaxation_times[1:]), OMEGA
+    )
+    for name, factor in (("a", 1.0), ("b", 1.001)):
+        columns = np.column_stack([OMEGA, factor * G[0], G[1]])
+        head = "angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa"
+        np.savetxt(tmp_path / f"{name}.csv", columns, delimiter=",", header=head, comments="")
+    files = [str(tmp_path / "a.csv"), "--with", str(tmp_path / "b.csv")]
+    assert main([*files, "--modes", "1", "--density", "2000", "--out", str(tmp_path)]) == 0
+    assert json.loads((tmp_path / "fit.json").read_text())["shear_waves"]["density_kg_m3"] == 2000
 
 
 @pytest.mark.draws

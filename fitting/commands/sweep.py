@@ -329,7 +329,8 @@ def _check_precompression(options: argparse.Namespace) -> None:
     for name, asked in (("--with", bool(options.others)), ("all samples but one", len(options.sweep) > 1)):
         if asked:
             raise InputError(f"--precompression works only for a single sweep: remove {name}, or --precompression")
-    for name, asked in (("--profile", options.profile), ("--samples", options.samples is not None)):
+    uncompressed = {"--profile": options.profile, "--samples": options.samples is not None}
+    for name, asked in (*uncompressed.items(), ("--predict", bool(options.predict))):
         if asked:
             raise InputError(
                 f"{name} works only for a sample that is not compressed: remove {name}, or --precompression"

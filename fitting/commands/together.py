@@ -33,7 +33,7 @@ def run(options: argparse.Namespace) -> int:
     relative = total_error.of_geometry(rig, None)
     with named_bar(f"{len(tests)} tests") as told:
         found = springpots_in_time.choose_together(tests, options.model, options.modes, told, relative)
-    together_report.write(options.out, found, relative)
+    together_report.write(options.out, found, relative, options.density)
     print(together_report.table(found, relative))
     if options.cards:
         shared_options.write_cards(options.out, found.model)

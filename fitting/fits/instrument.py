@@ -10,6 +10,7 @@ The friction b of the bearing adds b omega / K to G''. The error of b has a norm
 deviation that the user gives.
 """
 
+import time
 from typing import NamedTuple
 
 import numpy as np
@@ -116,7 +117,7 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
     Prony modes. If one of the errors changes when the upper end of the band is left out, all errors are reported, but
     the moduli are not corrected for them. If the number of modes was chosen automatically, more modes are tried, too.
     """
-    known = nuisances_of(sweep)
+    begin, known = time.perf_counter(), nuisances_of(sweep)
     if not known or fit.kind.values is not None or not isinstance(fit.solution.u, np.ndarray):
         return fit, sweep
     weighed = _with_noise_as_measured(sweep)
@@ -127,14 +128,17 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
     if errors is None:
         errors = _in_both_bands(best, weighed)
         details = fit.details | {"instrument": instrument_numbers(errors, known)}
-        return fit._replace(details=details, warnings=(*fit.warnings, *_not_corrected(errors, known))), sweep
+        warnings, seconds = (*fit.warnings, *_not_corrected(errors, known)), fit.run_time + time.perf_counter() - begin
+        return fit._replace(details=details, warnings=warnings, run_time=seconds), sweep
     corrected = _shifted(weighed, known, best.values)
     corrected = corrected._replace(notes=(*sweep.notes, *_corrections(known, best)))
     details = fit.details | {"instrument": instrument_numbers(errors, known)}
-    refitted = best.fit._replace(details=details)
+    refitted = best.fit._replace(details=details, compile_time=fit.compile_time)
     if viscoelastic.TRIED in details:
         refitted = _beside_more_modes(fit, refitted, tried, weighed)
-    return refitted._replace(uncertainty=_with_directions(refitted, corrected, known, best.covariance)), corrected
+    spread = _with_directions(refitted, corrected, known, best.covariance)
+    seconds = fit.run_time + time.perf_counter() - begin
+    return refitted._replace(uncertainty=spread, run_time=seconds), corrected
 
 
 def _with_more_modes(fit: Fit, sweep: Sweep) -> list[Corrected]:

@@ -143,7 +143,7 @@ def _populations(fits: list[Fit]) -> dict[str, Population | None]:
     for name in (*dict.fromkeys(n for row in known for n in row if "[" not in n), *names):
         pairs = np.array([row.get(name, (0.0, np.inf)) for row in known])
         found = population(pairs[:, 0], pairs[:, 1])
-        if found is not None and name.startswith("ratios["):  # a ratio cannot exceed 1
+        if found is not None and (name.startswith("ratios[") or "exponent" in name):  # these cannot exceed 1
             of_mean, of_new = ((low, min(1.0, high)) for low, high in (found.mean_interval, found.new_interval))
             found = found._replace(mean_interval=of_mean, new_interval=of_new)
         out[name] = found
@@ -240,7 +240,10 @@ def _place(name: str) -> int:
 
 def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str, Population | None]) -> Maxwell:
     """Return the Prony modes of a typical sample, whose parameters are the means of the populations. Modes without a
-    mean are not included. For other parameters without a mean, the median of the samples is used."""
+    mean are not included. For other parameters without a mean, the median of the samples is used.
+
+    The equilibrium modulus of Prony modes is also the mean of the population: the mean ratios are multiplied by one
+    factor, because their sum alone would give another equilibrium modulus."""
     kind, every = fits[0].kind, [values_of_sample(f) for f in fits]
     middle = {n: float(np.median([row.get(n, (0.0,))[0] for row in every])) for n in populations}
     mean = {name: p.mean for name, p in populations.items() if p is not None}
@@ -249,7 +252,9 @@ def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str,
             raise InputError("the samples together do not determine the shear modulus: fit each sample separately")
         known = [k for k in range(len(populations)) if {f"ratios[{k}]", f"relaxation_times[{k}]"} <= set(mean)]
         ratios, times = (np.array([mean[f"{n}[{k}]"] for k in known]) for n in ("ratios", "relaxation_times"))
-        ratios = ratios * min(1.0, (1 - 1e-9) / max(ratios.sum(), 1e-300))
+        rest = mean.get("equilibrium_modulus", 0.0) / mean["shear_modulus"]
+        factor = (1 - max(rest, 1e-9)) / max(ratios.sum(), 1e-300)
+        ratios = ratios * (factor if 0 < rest < 1 else min(1.0, factor))
         return Maxwell(mean["shear_modulus"], ratios, times)  # type: ignore[arg-type]
     low, high = min(s.angular_frequency[0] for s in sweeps), max(s.angular_frequency[-1] for s in sweeps)
     if kind.effective is not None:

@@ -407,12 +407,12 @@ def _of_rises(chosen: Together) -> list[str]:
     return out
 
 
-def disagreements(shares: list[Share]) -> list[str]:
-    """Return a warning for each test whose misfit is much larger in the common fit than in a fit to this test alone."""
+def disagreements(shares: list[Share], remedy: str = "try more modes") -> list[str]:
+    """Return a warning for each test that the common fit misses by much more than a fit to this test alone does."""
     return [
         f"the tests do not agree. The misfit of {s.source or s.name} is {100 * s.misfit:.2g} % in the common fit, but "
         f"only {100 * s.misfit_alone:.2g} % in a fit to this test alone: check whether this test was made at another "
-        "temperature or strain, or on another sample; otherwise try more modes"
+        f"temperature or strain, or on another sample; otherwise {remedy}"
         for s in shares
         if s.noise > APART * s.alone and s.misfit > 0.01
     ]

@@ -154,6 +154,12 @@ def wider(estimate: Estimate, direction: np.ndarray) -> Estimate:
     )
 
 
+def without_part(error: float, part: float) -> float:
+    """Return a standard error without one of its independent parts (difference of squares), or 0 if the part is
+    larger."""
+    return float(np.sqrt(max(0.0, (error - part) * (error + part))))
+
+
 def with_shared_errors(estimate: Estimate, other: Estimate) -> Estimate:
     """Return the estimate with the systematic errors (`shared`) of `other` added. The ratio of each error to the value
     of its parameter is the same as in `other`."""

@@ -49,6 +49,11 @@ class Sweep(NamedTuple):
         return first, second
 
     @property
+    def as_measured(self) -> "Sweep":
+        """The sweep without the standard deviations that a correction added as weights (`sd_before`)."""
+        return self._replace(storage_sd=None, loss_sd=None, sd_before=False) if self.sd_before else self
+
+    @property
     def noise_given(self) -> bool:
         """Whether standard deviations are given that describe the noise of each point, not the spread between
         samples."""

@@ -163,7 +163,7 @@ def warnings(found: Samples) -> list[str]:
     if failed:
         out.append(
             f"the fit of {', '.join(failed)} did not converge, and the parameters with the smallest "
-            "misfit so far are given: try fewer modes"
+            f"misfit so far are given: try {'fewer modes' if found.kind.values is None else 'another --model'}"
         )
     for words, told in COUNTED:
         count = sum(any(words in w for w in f.warnings) for f in found.fits)
@@ -181,14 +181,17 @@ def _limits_of_typical(found: Samples) -> list[str]:
     """Return a warning if the equilibrium modulus of the Prony modes at the top of fit.json differs from the population
     mean."""
     p = found.populations.get("equilibrium_modulus")
-    if found.kind.values is None or p is None:
+    if p is None:
         return []
     rest = limits.of_the_modes(found.typical)["equilibrium_modulus"]
     if abs(rest / p.mean - 1) < APART:
         return []
+    why = f"the modes agree with the model {found.kind.name} only over the measured band"
+    if found.kind.values is None:
+        why = "the mean ratios do not agree with the mean moduli, so use the values of the population"
     return [
         f"the equilibrium modulus of the typical sample's Prony modes is {rest:.4g} Pa, but the population mean is "
-        f"{p.mean:.4g} Pa: the modes agree with the model {found.kind.name} only over the measured band"
+        f"{p.mean:.4g} Pa: {why}"
     ]
 
 

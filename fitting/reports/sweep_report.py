@@ -211,7 +211,7 @@ def write(
     content = numbers(content)
     write_whole(out / "fit.json", json.dumps(content, indent=2, allow_nan=False) + "\n")
     save(figure(sweep, fits), out / "fit.png")
-    _store(out / "fit.h5", sweep, fits, content)
+    _store(out / "fit.h5", sweep.as_measured, fits, content)
     return content
 
 
@@ -278,8 +278,8 @@ def draw_moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
     fine = np.geomspace(f[0], f[-1], 400)
     lines = _moduli_as_measured(closed, 2 * np.pi * fine)
     rows = (
-        ("G'", sweep.storage, sweep.storage_sd, fit.storage, BLUE, lines[0], "o", "x"),
-        ("G''", sweep.loss, sweep.loss_sd, fit.loss, ORANGE, lines[1], "s", "+"),
+        ("G'", sweep.storage, sweep.as_measured.storage_sd, fit.storage, BLUE, lines[0], "o", "x"),
+        ("G''", sweep.loss, sweep.as_measured.loss_sd, fit.loss, ORANGE, lines[1], "s", "+"),
     )
     bands = _bands(closed, sweep)
     for symbol, data, sd, fitted, colour, line, marker, cross in rows:

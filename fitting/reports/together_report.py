@@ -36,7 +36,7 @@ QUANTITIES = {
 }
 
 
-def write(out: Path, found: Together, relative: float) -> Content:
+def write(out: Path, found: Together, relative: float, density: float | None = None) -> Content:
     """Write fit.json and fit.png. Return the content of fit.json, which has the same keys as for a sweep, and the key
     `tests`.
 
@@ -45,6 +45,7 @@ def write(out: Path, found: Together, relative: float) -> Content:
         found: the fit.
         relative: relative error of the moduli of a test due to the size of its sample, common to all moduli of the
             test.
+        density: density of the material [kg/m^3]; None: the density of the shear waves among the tests, if any.
     """
     out.mkdir(parents=True, exist_ok=True)
     u, n = found.uncertainty, found.modes
@@ -67,7 +68,7 @@ def write(out: Path, found: Together, relative: float) -> Content:
             "correlation_names": list(u.names),
             "mean_relative_error": float(errors @ points / points.sum()),
             "max_relative_error": max(_largest(found)),
-            "shear_waves": _waves(found),
+            "shear_waves": _waves(found, density),
             **_total_errors(found, relative),
             "tests": [_share_of_test(s, found) for s in found.shares],
             "warnings": list(found.warnings),
@@ -89,11 +90,11 @@ def _total_errors(found: Together, relative: float) -> Content:
     return {"total_errors": by_stem(whole), "error_shares": {source: by_stem(part) for source, part in shares.items()}}
 
 
-def _waves(found: Together) -> Content:
+def _waves(found: Together, density: float | None) -> Content:
     """Return speed and attenuation of shear waves over the band of all tests, at four frequencies per decade."""
     high, low = 1 / min(t.resolved[0] for t in found.tests), 1 / max(t.resolved[1] for t in found.tests)
     omega = np.geomspace(low, high, max(2, 1 + int(4 * np.log10(high / low))))
-    density = next((t.density for t in found.tests if isinstance(t, Dispersion)), None)
+    density = density or next((t.density for t in found.tests if isinstance(t, Dispersion)), None)
     return shear_waves.waves_of_moduli(*moduli(found.model, omega), omega, density)
 
 

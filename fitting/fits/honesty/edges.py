@@ -11,8 +11,10 @@ from fitting.fits.honesty.long_times import with_interval
 from fitting.fits.time_tests import TimeFit
 from fitting.fits.viscoelastic import FLUID, MISSES, Fit
 from fitting.methods import generalised_maxwell, host, kramers_kronig, relaxation_spectrum, springpots
+from fitting.methods.estimate import without_part
 from fitting.methods.generalised_maxwell import Spectrum
 from fitting.methods.least_squares import from_starts
+from fitting.methods.uncertainty import equilibrium_change, equilibrium_error
 from fitting.readers.rheometer import Sweep, some
 
 HALF_DECADE = float(np.sqrt(10))
@@ -72,7 +74,10 @@ def _with_long_times(fit: Fit, sweep: Sweep) -> Fit:
     # For a compressed sample, each reported modulus is the modulus that fits the data, times a factor.
     of = "shear_modulus" if fluid else "equilibrium_modulus"
     factor = float(getattr(fit.model, of) / max(float(getattr(own, of)), 1e-300))
-    return with_interval(fit, [sweep], [fit.uncertainty.noise], factor) if factor > 0 else fit
+    u, common = fit.uncertainty, 0.0
+    if u.shared is not None:
+        common = float(np.linalg.norm(equilibrium_change(u.values, u.shared)))
+    return with_interval(fit, [sweep], [u.noise], factor, common) if factor > 0 else fit
 
 
 def _nearest(fit: Fit, sweep: Sweep, misfit: float) -> str:
@@ -105,9 +110,24 @@ def _points_left(sweep: Sweep) -> dict[str, np.ndarray]:
 
 def values(fit: Fit | TimeFit) -> dict[str, tuple[float, float]]:
     """Return the value and the standard error of each parameter that is compared. The keys are the names of the
-    parameters in the report."""
-    from fitting.methods.uncertainty import equilibrium_error
+    parameters in the report. The standard errors do not contain the error of the gap (--gap-error), because a wrong
+    gap multiplies the moduli at all frequencies by one factor. So this error explains no change of a parameter if one
+    end of the band is left out."""
+    gap, every = fit.details.get("gap_error", 0.0), _with_all_errors(fit)
+    if not gap:
+        return every
+    moduli = moduli_among(fit)
+    return {n: (v, without_part(e, gap * v) if n in moduli else e) for n, (v, e) in every.items()}
 
+
+def moduli_among(fit: Fit | TimeFit) -> set[str]:
+    """Return the names of the parameters that are proportional to the measured moduli."""
+    if fit.parameters is None:
+        return {"shear_modulus", "equilibrium_modulus"}
+    return {n for n, unit in zip(fit.kind.names, fit.kind.units, strict=True) if unit.startswith("Pa")}
+
+
+def _with_all_errors(fit: Fit | TimeFit) -> dict[str, tuple[float, float]]:
     if fit.parameters is not None:
         rows = zip(fit.kind.names, fit.parameters.values, fit.parameters.standard_errors, strict=True)
         return {n: (float(v), float(e)) for n, v, e in rows if not n.startswith("strengths[")}

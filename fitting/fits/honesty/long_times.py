@@ -18,6 +18,7 @@ from fitting.fits.honesty import alike_points
 from fitting.fits.time_tests import TimeFit
 from fitting.fits.together import Measured, Together
 from fitting.fits.viscoelastic import SHORT, Fit, Kind
+from fitting.methods.estimate import without_part
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.host import Array, arrays_of
 from fitting.methods.least_squares import Solution, from_starts
@@ -193,18 +194,26 @@ def with_interval(
         return fit
     low, high = factor * found.low, factor * found.high
     rest = max(0.0, float(fit.model.shear_modulus * (1 - np.sum(fit.model.ratios))))
+    # A common error widens the interval and the standard error alike, so it is left out of their comparison.
+    alone = without_part(error, common)
+    half = max(rest - low, high - rest)
+    wider = half > max(WIDER * NORMAL * alone, LARGE * rest)
+    beyond = without_part(half / NORMAL, alone)
     low = max(0.0, rest - float(np.hypot(rest - low, NORMAL * common)))
     high = rest + float(np.hypot(high - rest, NORMAL * common))
     whole = float(fit.model.shear_modulus)
-    told: list[str] = _told_interval((low, rest, high), error, found, whole)
+    told: list[str] = _told_interval((low, rest, high), error, found, whole, wider)
     numbers = {"low": low, "high": high, "longest_relaxation_time": found.longest, "modes": found.modes}
-    details = details | {INTERVAL: numbers | {"wider_than_standard_error": bool(told)}}
+    numbers |= {"beyond_standard_error": beyond, "wider_than_standard_error": bool(told)}
+    details = details | {INTERVAL: numbers}
     return fit._replace(details=details, warnings=(*fit.warnings, *told))
 
 
-def _told_interval(ends: tuple[float, float, float], error: float, found: Interval, whole: float) -> list[str]:
-    """Return a warning if an end of the interval lies much farther from the value than two standard errors. `ends`:
-    (low, value, high). For a fluid, a warning is given if `high` is at least `LARGE` times `whole` (G0).
+def _told_interval(
+    ends: tuple[float, float, float], error: float, found: Interval, whole: float, wider: bool
+) -> list[str]:
+    """Return a warning if an end of the interval lies much farther from the value than two standard errors (`wider`).
+    `ends`: (low, value, high). For a fluid, a warning is given if `high` is at least `LARGE` times `whole` (G0).
 
     The comparison uses the factor `NORMAL` even for few independent residuals, where Student's t is larger, because
     readers understand the number after ± as a standard error.
@@ -218,7 +227,7 @@ def _told_interval(ends: tuple[float, float, float], error: float, found: Interv
             f"a solid fits the data as well as the fluid. The equilibrium modulus of the solid may be 0 to "
             f"{high:.3g} Pa (95 %), {where}: only a longer test can decide"
         ]
-    if max(rest - low, high - rest) <= max(WIDER * NORMAL * error, LARGE * rest):
+    if not wider:
         return []
     return [
         f"{SHORT}: the equilibrium modulus may be {low:.3g} to {high:.3g} Pa (95 %), {where}. The value {rest:.4g} ± "

@@ -7,7 +7,7 @@ samples is not included: the parameters describe the measured curve, not the mat
 import numpy as np
 
 from fitting.fits.honesty import edges
-from fitting.fits.honesty.long_times import INTERVAL, NORMAL
+from fitting.fits.honesty.long_times import INTERVAL
 from fitting.fits.honesty.rise_of_load import OF_A_STEP, share_of_rise
 from fitting.fits.honesty.short_times import MISSING
 from fitting.fits.simulated_rheometer import Simulation
@@ -23,28 +23,28 @@ def of_geometry(simulation: Simulation, gap_error: float | None) -> float:
     """Return the relative error of all moduli due to the size of the sample between the plates. Torque divided by twist
     is G pi R^4 / (2 h) for the shear modulus G, the radius R and the gap h.
 
-    If a `gap_error` [m] is given, the standard errors already contain the error of the gap, so only the error of the
-    radius is counted here.
+    `gap_error`: standard deviation [m] of the gap; None: `GAP`.
     """
-    gap = 0.0 if gap_error is not None else GAP / simulation.height
-    return float(np.hypot(gap, 4 * RADIUS / simulation.radius))
+    gap = GAP if gap_error is None else gap_error
+    return float(np.hypot(gap / simulation.height, 4 * RADIUS / simulation.radius))
 
 
 def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
     """Return the errors of the parameters: for each source of error, a dictionary with the parameter names of
-    `edges.values` as keys.
+    `edges.values` as keys. The error of the gap is a part of the share `geometry`.
 
     The share `band` is the larger change of a parameter if one end of the band is left out. This change counts only if
     it is larger than expected from noise (`edges.decided_by`). The square of the change due to noise is subtracted from
     the square of this change. If the change is very large (`edges.RUNS_AWAY`), the share is the size of the parameter.
     The share `long_times` comes from the farther end of `long_times.equilibrium_interval`, converted to a standard
-    deviation. The share `short_times` is the part of G0 that `short_times` finds to be missing. The share
-    `rise_of_load` is the change if the load was a step at the first row that shows the new load.
+    deviation, without the standard error. The share `short_times` is the part of G0 that `short_times` finds to be
+    missing. The share `rise_of_load` is the change if the load was a step at the first row that shows the new load.
     """
     known = edges.values(fit)
     noise = {name: error for name, (_, error) in known.items()}
-    relative = fit.details.get("geometry_error", of_geometry(Simulation(), None))
-    moduli = _moduli(fit)
+    gap, usual = fit.details.get("gap_error"), Simulation()
+    relative = fit.details.get("geometry_error", of_geometry(usual, gap and gap * usual.height))
+    moduli = edges.moduli_among(fit)
     out = {
         "noise": noise,
         "geometry": {n: relative * abs(v) if n in moduli else 0.0 for n, (v, _) in known.items()},
@@ -63,10 +63,7 @@ def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
             out[source] = _of_modes(fit, moved)
     interval = fit.details.get(INTERVAL)
     if interval and interval["wider_than_standard_error"] and "equilibrium_modulus" in known:
-        value, error = known["equilibrium_modulus"]
-        half = max(value - interval["low"], interval["high"] - value) / NORMAL
-        beyond = float(np.sqrt(max(0.0, half**2 - error**2)))
-        out["long_times"] = dict.fromkeys(known, 0.0) | {"equilibrium_modulus": beyond}
+        out["long_times"] = dict.fromkeys(known, 0.0) | {"equilibrium_modulus": interval["beyond_standard_error"]}
     if isinstance(fit, TimeFit) and OF_A_STEP in fit.details:
         out["rise_of_load"] = share_of_rise(fit, list(known))
     if MISSING in fit.details and "shear_modulus" in known:
@@ -82,12 +79,6 @@ def total_errors(fit: Fit | TimeFit) -> dict[str, float]:
 def root_of_squares(shares: dict[str, dict[str, float]]) -> dict[str, float]:
     """Return the total errors by name, from the errors of independent sources."""
     return {name: float(np.sqrt(sum(part[name] ** 2 for part in shares.values()))) for name in shares["noise"]}
-
-
-def _moduli(fit: Fit | TimeFit) -> set[str]:
-    if fit.parameters is None:
-        return {"shear_modulus", "equilibrium_modulus"}
-    return {n for n, unit in zip(fit.kind.names, fit.kind.units, strict=True) if unit.startswith("Pa")}
 
 
 def _of_modes(fit: Fit | TimeFit, moved: np.ndarray) -> dict[str, float]:
