@@ -126,3 +126,5 @@ traction = [{where = {x_min = 0.02}, value = [100.0, 0.0, 0.0]}]
     x, reactions = waves._last_state(tmp_path / "result.h5", scene)
     assert waves._of_rest(scene, x, reactions, "--about run") == []
     assert waves._of_rest(scene, x, 0.9 * reactions, "--about run")
+    unknown = np.where(reactions == 0, 0.0, np.nan)
+    assert "was not checked, because a traction of that run" in waves._of_rest(scene, x, unknown, "--about run")[0]

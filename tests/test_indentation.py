@@ -365,6 +365,8 @@ def test_depths_near_the_end_of_the_table_are_fitted(tmp_path, capsys):
         assert main(ask) == code
     assert json.loads((tmp_path / "out" / "fit.json").read_text())["young_modulus"] == pytest.approx(E, rel=1e-6)
     assert "m or more after contact, but for this layer and indenter only depths up to" in capsys.readouterr().err
+    ask[ask.index("0.0002")] = "1e-9"  # all depths are beyond the table of so thin a layer
+    assert main(ask) == 2 and "m or more after contact" in capsys.readouterr().err
 
 
 def test_an_approach_as_long_as_the_layer_is_thick_is_fitted():

@@ -427,5 +427,9 @@ def test_rounded_positions_are_on_the_grid(tmp_path):
         np.testing.assert_array_equal(at, index)
         np.testing.assert_allclose(spacing, [0.002, 0.0025, 0.003], rtol=0.01)
         assert shape == (5, 6, 7)
+    apart = index + np.where(index[:, :1] > 2, [[60, 0, 0]], 0)  # two bodies, 60 voxels apart
+    at, spacing, _, shape = formats._grid(tmp_path, apart * 0.0015)
+    np.testing.assert_array_equal(at, apart)
+    assert np.allclose(spacing, 0.0015) and shape == (65, 6, 7)
     with pytest.raises(InputError, match="is not on a regular grid"):
         formats._grid(tmp_path, exact + rng.uniform(-2e-4, 2e-4, exact.shape))

@@ -83,4 +83,4 @@ def test_edges_in_a_map_are_told(modulus):
     found = elastography.regions_of(organ)
     drawn = stiffness_map.map_of(elastography.problem_of_map(organ, found, 4 * STEP))
     told = cautions.cautions_of_elastography(organ, found, drawn)
-    assert any("within 8 mm. Near such an edge" in s for s in told) == (modulus in (_edge, _modulus))
+    assert any("within 8 mm (or within an element" in s for s in told) == (modulus in (_edge, _modulus))

@@ -60,7 +60,7 @@ def _notes_on_shape(options: argparse.Namespace) -> list[str]:
 
 def run(options: argparse.Namespace) -> int:
     """Fit the curve. The exit code is 1 if the modulus is not positive."""
-    from fitting.methods.contact_point import beyond, fit_with_offset, fit_without_tilt
+    from fitting.methods.contact_point import SHALLOWEST, beyond, fit_with_offset, fit_without_tilt
     from fitting.readers.indentation_curves import read_indentation
     from fitting.reports import indentation_report
     from fitting.rigs.thin_layer import Indenter, Layer
@@ -79,13 +79,16 @@ def run(options: argparse.Namespace) -> int:
     for note in (*_notes_on_shape(options), *curve.notes):
         print(f"note: {note}", file=sys.stderr)
     writable(options.out, ("fit.json", "fit.png"))
-    found = fit_with_offset(curve.depth, curve.force, layer.force, layer.deepest)
-    if beyond(found, curve.depth, layer.deepest):
+    found = None
+    if layer.deepest > 2 * SHALLOWEST * (curve.depth.max() - curve.depth.min()):
+        found = fit_with_offset(curve.depth, curve.force, layer.force, layer.deepest)
+    if found is None or beyond(found, curve.depth, layer.deepest):
         raise InputError(
             f"{options.file}: the deepest point is {layer.deepest:.4g} m or more after contact, but for this layer and "
             f"indenter only depths up to {layer.deepest:.4g} m can be computed: remove the deepest points"
         )
     level = fit_without_tilt(curve.depth, curve.force, layer.force, found, layer.deepest)
+    level = None if level is None or beyond(level, curve.depth, layer.deepest) else level
     content = indentation_report.write(options.out, curve, rig, found, level)
     print(indentation_report.table(rig, found, content))
     for sentence in content["warnings"]:

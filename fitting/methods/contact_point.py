@@ -17,6 +17,8 @@ from fitting.methods.noise.alike_noise import Alike, along_rows
 from fitting.methods.noise.uneven_noise import uneven_root
 
 _GRID = 200
+#: The contact point is searched up to this distance before the last depth, divided by the range of the depths.
+SHALLOWEST = 1e-3
 #: Distance of neighbouring contact points for a central difference, divided by the range of the depths.
 _NEIGHBOUR = 1e-5
 #: If the noise, divided by the largest fitted force, is below this value, the residuals are roundoff.
@@ -69,7 +71,7 @@ def fit_contact(
         base: model of the force without contact: "zero", "constant" (unknown offset of the sensor) or "line" (the
             sensor also drifts).
         deepest: largest depth [m] from the contact point for which `unit_force` is known. Earlier contact points are
-            not tried.
+            not tried. It must be larger than twice `SHALLOWEST` times the range of the depths.
     """
     span = float(np.ptp(depth))
     h = _NEIGHBOUR * span
@@ -89,7 +91,7 @@ def fit_contact(
 
     # The contact point may lie before the first measured depth, but not after the last one.
     earliest = max(depth.min() - 0.5 * span, depth.max() - deepest + 2 * h)
-    grid = np.linspace(earliest, depth.max() - 1e-3 * span, _GRID)
+    grid = np.linspace(earliest, depth.max() - SHALLOWEST * span, _GRID)
     k = int(np.argmin([misfit(start) for start in grid]))
     low, high = grid[max(k - 1, 0)], grid[min(k + 1, _GRID - 1)]
     start = float(

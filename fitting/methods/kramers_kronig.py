@@ -21,11 +21,11 @@ import scipy.special
 from fitting.methods.generalised_maxwell import Spectrum
 from fitting.readers.frequency_sweep import FEWEST, Sweep, merged, scatter, some
 
-#: A violation of the bounds counts if it is larger than SIGNIFICANT (1 + _FEW_POINTS / n) standard deviations of the
+#: A violation of the bounds counts if it is larger than SIGNIFICANT (1 + _FEW_POINTS / n^2) standard deviations of the
 #: scatter, where n is the number of frequencies, and also larger than NEGLIGIBLE times the modulus. The scatter of few
 #: points is uncertain, and often too small. With this limit, fewer than 1 % of the sweeps of a constant modulus with
-#: random errors (10 to 60 frequencies) show a violation in the last half decade.
-SIGNIFICANT, _FEW_POINTS, NEGLIGIBLE = 4.0, 8, 0.002
+#: random errors (8 to 60 frequencies) show a violation in the last half decade.
+SIGNIFICANT, _FEW_POINTS, NEGLIGIBLE = 4.0, 80, 0.002
 #: A warning is given if the relative distance of the best spectrum from the data is larger than FAR, and also larger
 #: than FAR_RATIO times the scatter.
 FAR, FAR_RATIO = 0.01, 5.0
@@ -115,7 +115,7 @@ def _noise_of_loss(sweep: Sweep, same: float) -> np.ndarray:
 def _breaches(sweep: Sweep) -> list[str]:
     """Return for each pair of neighbouring frequencies the result of `_breach`."""
     omega, storage, loss = merged(sweep.angular_frequency, sweep.storage, sweep.loss)
-    limit = SIGNIFICANT * (1 + _FEW_POINTS / len(omega))
+    limit = SIGNIFICANT * (1 + _FEW_POINTS / len(omega) ** 2)
     of_storage, of_loss = limit * scatter(omega, storage), limit * _noise_of_loss(sweep, scatter(omega, loss))
     pairs = [slice(k, k + 2) for k in range(len(omega) - 1)]
     return [_breach(omega[own], storage[own], loss[own], (of_storage, of_loss[own])) for own in pairs]

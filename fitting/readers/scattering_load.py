@@ -6,8 +6,9 @@ from fitting.readers.noise_of_series import noise_of_series
 
 #: Scatter of the load below this fraction of the largest load is ignored.
 QUIET = 1e-3
-#: The scatter of the hold replaces the scatter of all rows if the scatter of all rows is larger by this factor.
-_RAMP = 3.0
+#: In files of _FEW_ROWS rows or fewer, the scatter of the hold replaces the scatter of all rows if the scatter of all
+#: rows is larger by the factor _RAMP.
+_FEW_ROWS, _RAMP = 10, 3.0
 
 
 def without_scatter(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[np.ndarray, list[str]]:
@@ -17,9 +18,9 @@ def without_scatter(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[np
     The model treats every change between two readings as a real change of the load. So it would also treat the scatter
     of a sensor as a change of the load.
     """
-    size, noise, held_noise = float(np.max(np.abs(driven))), noise_of_series(driven), _of_the_hold(driven)
-    if noise > _RAMP * held_noise:  # the ramp is a large part of the rows, and its corners are not scatter
-        noise = held_noise
+    size, noise = float(np.max(np.abs(driven))), noise_of_series(driven)
+    if len(driven) <= _FEW_ROWS and noise > _RAMP * _of_the_hold(driven):
+        noise = _of_the_hold(driven)  # the ramp is a large part of the rows, and its corners are not scatter
     if not min(noise, _from_neighbours(time, driven)) > QUIET * size:
         return driven, []
     level = np.median(driven[np.abs(driven) > size / 2])
@@ -54,7 +55,8 @@ def without_scatter(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[np
 
 def _of_the_hold(driven: np.ndarray) -> float:
     """Return the scatter of the load at the end of the hold, from the differences of neighbouring rows. Only rows above
-    half of the largest load are used, and of these the later half. The result is infinite if there is one such row."""
+    half of the largest load are used, and of these the later half. The result is infinite if there are fewer than
+    two such rows."""
     steps = np.abs(np.diff(driven[np.abs(driven) > np.max(np.abs(driven)) / 2]))
     late = steps[len(steps) // 2 :]
     return float(np.quantile(late, 0.75)) / (1.1503 * np.sqrt(2)) if len(late) else np.inf

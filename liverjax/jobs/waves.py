@@ -75,7 +75,8 @@ def solved_waves(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
 def _last_state(file: Path, scene: Scene) -> tuple[jax.Array, np.ndarray]:
     """Read positions [m] and reactions [N] (V, 3) of the last step in the file.
 
-    A reaction also balances the load at its node. So the reactions are set to 0 where a traction of the run acts.
+    A reaction also balances the load at its node. So the reactions are NaN at held nodes where a traction of the run
+    acts.
     """
     import h5py
 
@@ -97,7 +98,8 @@ def _last_state(file: Path, scene: Scene) -> tuple[jax.Array, np.ndarray]:
         raise InputError(
             f"--about {file}: the last step of this run is {status.NAMES[code]}; give a run that ended in equilibrium"
         )
-    reactions[_nodes_under_traction_of(text, scene)] = 0.0
+    loaded = _nodes_under_traction_of(text, scene)
+    reactions[loaded[np.any(reactions[loaded] != 0, axis=1)]] = np.nan
     return jnp.asarray(x), reactions
 
 
@@ -112,12 +114,18 @@ def _nodes_under_traction_of(text: str, scene: Scene) -> np.ndarray:
 def _of_rest(scene: Scene, x: jax.Array, reactions: np.ndarray, name: str) -> list[str]:
     """Return a warning if the reactions (V, 3) [N] of a run differ from those of the relaxed body at the positions x.
 
-    Nodes without a reaction are not compared. If the reactions differ, the stress of the run also differs from the
-    relaxed stress. There is no warning for a porous body.
+    Nodes whose reaction is 0 or not known (NaN) are not compared. If the reactions differ, the stress of the run also
+    differs from the relaxed stress. There is no warning for a porous body.
     """
-    pulled = np.linalg.norm(reactions, axis=1)
-    if scene.porosity is not None or not pulled.any():
+    norms = np.linalg.norm(reactions, axis=1)
+    pulled = np.nan_to_num(norms)
+    if scene.porosity is not None or not norms.any():
         return []
+    if not pulled.any():
+        return [
+            f"whether the stress in the state of {name} is relaxed was not checked, because a traction of that run "
+            "acts at all nodes with a reaction"
+        ]
     at = pulled > 0.01 * pulled.max()
     # Membranes, ligaments and springs also pull at fixed nodes. Obstacles and sliding supports do not.
     pulling = tuple(own for own in scene.physics if not isinstance(own, Obstacle | SlidingSupport))

@@ -46,7 +46,7 @@ def cautions_of_waves(scene: Scene, about: jax.Array | None = None) -> list[str]
     if scene.solve.frequencies is None:
         return said
     hertz = float(np.max(np.asarray(scene.solve.frequencies)))
-    said += _of_short_waves(scene, np.asarray(scene.solve.frequencies))
+    said += _of_short_waves(scene, np.atleast_1d(np.asarray(scene.solve.frequencies)))
     if scene.porosity is not None:
         said += of_drained_layer(scene, 1 / (2 * np.pi * hertz), f"at {hertz:.3g} Hz, within 1/omega = {{:.2g}} s,")
     return said

@@ -287,8 +287,10 @@ def _quick_number(text: str, between: str) -> float | None:
         return to_number(text, between)
 
 
-#: Steps between positions that are shorter than this fraction of the longest step are errors of the positions.
-_JITTER = 0.05
+#: _JITTER: if the positions are on no regular grid, steps that are shorter than this fraction of the longest step are
+#: regarded as errors of the positions. _LONGEST: a grid cannot have more voxels along an axis. _UNEVEN: maximum
+#: distance of a position from the grid, divided by the spacing.
+_JITTER, _LONGEST, _UNEVEN = 0.05, 10_000, 0.05
 
 
 def _grid(path: Path, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]:
@@ -298,21 +300,29 @@ def _grid(path: Path, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
         raise InputError(
             f"{path}: the file has no rows, or some rows have no x, y, z; give the position of every voxel in metres"
         )
-    spacing = np.empty(3)
-    for a in range(3):
-        steps = np.diff(np.unique(np.round(X[:, a], 9)))
-        if not len(steps):
-            raise InputError(f"{path}: all voxels have the same {'xyz'[a]}; waves need a volume, not a single slice")
-        steps = steps[steps > _JITTER * steps.max()]
-        spacing[a] = steps[steps < 1.5 * steps.min()].mean()
-    origin = X.min(axis=0)
-    # Positions in a file are rounded, so the total length gives a more exact spacing than single steps.
-    spacing = np.ptp(X, axis=0) / np.rint(np.ptp(X, axis=0) / spacing)
+    spacing, origin = np.empty(3), X.min(axis=0)
+    for a, axis in enumerate("xyz"):
+        found = _spacing_along(path, X[:, a] - origin[a], axis)
+        if found is None:
+            raise InputError(f"{path}: {axis} is not on a regular grid; give voxels with equal spacing")
+        spacing[a] = found
     at = np.rint((X - origin) / spacing).astype(int)
-    off = np.abs(X - origin - at * spacing).max(axis=0) / spacing
-    if off.max() > 0.05:
-        raise InputError(f"{path}: {'xyz'[int(off.argmax())]} is not on a regular grid; give voxels with equal spacing")
     return at, spacing, origin, tuple(int(n) for n in at.max(axis=0) + 1)
+
+
+def _spacing_along(path: Path, x: np.ndarray, axis: str) -> float | None:
+    """Return the spacing [m] of positions x (n,) along one axis, measured from the first one. Return None if they are
+    on no regular grid."""
+    steps = np.diff(np.unique(np.round(x, 9)))
+    if not len(steps):
+        raise InputError(f"{path}: all voxels have the same {axis}; waves need a volume, not a single slice")
+    for real in (steps, steps[steps > _JITTER * steps.max()]):
+        # Positions in a file are rounded, so the total length gives a more exact spacing than single steps.
+        number = np.rint(x.max() / real[real < 1.5 * real.min()].mean())
+        h = x.max() / number
+        if number < _LONGEST and np.abs(x - h * np.rint(x / h)).max() <= _UNEVEN * h:
+            return float(h)
+    return None
 
 
 def _nifti(path: Path) -> Content:
