@@ -72,6 +72,24 @@ def test_springpots_about_a_stretched_state(part):
         assert np.abs(moved - exact).max() > 1e-2 * np.abs(exact).max()
 
 
+@pytest.mark.parametrize("spring", [0.0, 1.5])
+def test_a_springpot_without_spring_or_with_a_stiff_one(spring, tmp_path):
+    """The factors are spring + (i omega tau)^0.2. Both springs were refused with words about [viscosity], which the
+    file does not have; a support, which has no tension, was refused as well."""
+    text = FILE.replace("[3, 1, 1]", "[1, 1, 1]") + "frequencies = [60.0]\n[[support]]\nwhere = {x_min = 0.03}\n"
+    springpots = f"[springpots]\ntimes = [0.0125]\nexponents = [0.2]\nspring = {spring}\n"
+    (tmp_path / "scene.toml").write_text(text + "stiffness = 1e4\n" + springpots)
+    scene = lj.load_scene(tmp_path / "scene.toml")
+    bare = replace(scene, springpots=None)
+    factors = spring + (2j * np.pi * 60.0 * 0.0125) ** 0.2
+    given = lj.harmonic(bare, factors=np.array([factors])).displacement
+    np.testing.assert_allclose(lj.harmonic(scene).check().displacement, given, rtol=1e-10, atol=1e-18)
+    body = replace(scene.body, gravity=jnp.array([0.0, 0.0, -0.1]))
+    if spring == 0:
+        with pytest.raises(lj.InputError, match=r"springpots.spring = 0 leaves no shear stiffness at rest"):
+            lj.harmonic(replace(scene, body=body))
+
+
 @pytest.mark.slow
 def test_springpots_of_a_scene_file(tmp_path):
     """A springpot, and a springpot in series with a spring, in parallel with 0.3 of the law; factors by mpmath."""

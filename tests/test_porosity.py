@@ -350,6 +350,23 @@ def test_warnings_about_the_drained_face_use_the_region_there():
     assert "300 to 400 Pa (it differs between regions)" in porosity.bulk_in_force(sponge.porosity, sponge.law)
 
 
+@pytest.mark.parametrize("kind", ["neo_hookean", "neo_hookean_compressible"])
+def test_the_drained_layer_contains_the_bulk_modulus_that_the_law_keeps(kind):
+    """The bulk modulus of a law was left out, so a layer that was thick enough was called too thin."""
+    changes = {"limit_bulk": 1e6, "permeability": 2e-9, "keep_bulk": True}
+    scene = column(8, 1, 1.0, **changes)
+    stiff = lj.laws.typical(kind)
+    stiff = replace(stiff, bulk=5e4) if kind == "neo_hookean" else replace(stiff, lame_lambda=5e4 - 2 / 3 * stiff.mu)
+    scene = replace(scene, law=stiff, porosity=replace(scene.porosity, keep_bulk=kind == "neo_hookean"))
+    M = 400.0 + 5e4 + 4 / 3 * float(stiff.mu)
+    seconds = (HEIGHT / 8) ** 2 * (1e-6 + 1 / M) / 2e-9
+    assert not of_drained_layer(scene, 1.01 * seconds, "in {:.3g} s")
+    assert of_drained_layer(scene, 0.99 * seconds, "in {:.3g} s")
+    if kind == "neo_hookean":  # without keep_bulk, the law has no bulk modulus here
+        apart = replace(scene, porosity=replace(scene.porosity, keep_bulk=False))
+        assert of_drained_layer(apart, 1.01 * seconds, "in {:.3g} s")
+
+
 @pytest.mark.parametrize(("part", "told"), [(0.3, True), (2.0, False)])
 def test_a_pressure_that_overshoots_beside_the_drained_face_is_told(part, told):
     """The load causes P = 1 at most. Steps of at least h^2/(4 kappa M) do not exceed this; shorter steps do by

@@ -12,6 +12,7 @@ from liverjax.mesh.refinement import places_in, quarters, refined
 from liverjax.mesh.selection import boundary_triangles
 from liverjax.mesh.surface import areas
 from liverjax.physics.attached import vessel
+from liverjax.physics.elastic_support import ElasticSupport
 from liverjax.physics.porosity import Inlet
 from liverjax.scenes.refined import can_be_refined, on_refined_mesh
 from liverjax.simulation.cautions import mesh_sentence
@@ -229,6 +230,28 @@ def test_only_numbers_by_element_are_given_to_the_parts():
     assert len(on_refined_mesh(scene)[0].porosity.inlet[0].triangles) == 4 * len(whole)
     each = replace(flux, flux=jnp.full(len(whole), 1e-6))
     assert can_be_refined(scene) and not can_be_refined(replace(scene, porosity=replace(sponge, inlet=(each,))))
+
+
+@pytest.mark.parametrize("steps", [7, 8])
+def test_a_history_with_a_row_for_each_triangle_is_no_number_by_triangle(steps):
+    """With as many times as triangles, the history counted as numbers by triangle. The pressure error was missing."""
+    mesh = lj.shapes.box((1.0, 1.0, 1.0), (2, 2, 2))
+    top = boundary_triangles(mesh, np.asarray(mesh.node_sets["z_max"]))
+    assert len(top) == 8
+    times, fluid = jnp.arange(float(steps)), column(1, 1).porosity
+    support = ElasticSupport(triangles=top, normal=1.0, times=times, history=jnp.ones(steps))
+    plane = lj.Obstacle(triangles=top, by=jnp.ones(3), times=times, history=jnp.ones(steps))
+    scene = lj.Scene(mesh=mesh, law=lj.laws.NeoHookean(mu=1.0, bulk=2.0), porosity=fluid, physics=(support, plane))
+    assert can_be_refined(scene)
+    assert not can_be_refined(replace(scene, physics=(replace(support, normal=jnp.ones(8)), plane)))
+    assert not can_be_refined(replace(scene, physics=(support, replace(plane, stiffness=jnp.ones(8)))))
+
+
+def test_vectors_of_an_obstacle_are_no_numbers_by_triangle():
+    """Three triangles had as many entries as a position. The pressure error was missing."""
+    scene = column(1, 1)
+    three = lj.Obstacle(triangles=scene.traction[0].triangles[jnp.array([0, 1, 0])], by=jnp.ones(3))
+    assert can_be_refined(replace(scene, physics=(three,)))
 
 
 @pytest.mark.slow

@@ -292,6 +292,10 @@ IDLE = {
         {"body": {"density": 1.0, "gravity": [0, 0, 1], "history": VECTORS}, "solve": {"dt": 0.1}},
         "gravity and a history of gravity",
     ),
+    "factors of no gravity": (
+        {"body": {"density": 1.0, "history": [[0.0, 0.0], [1.0, 1.0]]}, "solve": {"dt": 0.1}},
+        "factors that multiply gravity, but gravity is missing",
+    ),
     "sliding": (
         {"displaced": [TOP | {"by": LIFT}], "support": [TOP | {"sliding": True}]},
         "moves node 1 out of the plane of support.0",

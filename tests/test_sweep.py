@@ -19,6 +19,7 @@ from liverjax.commands.sweep import OUTPUTS
 from liverjax.core import status
 from liverjax.jobs import resumable_parts, sweep
 from liverjax.simulation.batch import strategy_for
+from liverjax.simulation.run import Result
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -327,6 +328,25 @@ def test_rows_are_refused_that_a_scene_file_may_not_have(files, column, good, ba
         sweep.read_sweep(files / "scene.toml", files / "rows.csv")
 
 
+def test_a_batch_refuses_times_that_do_not_increase(files):
+    """All sets after the first one were checked only for bounds. Such a run ended with status 0."""
+    (files / "scene.toml").write_text(SCENE.replace("steps = 2", "steps = 2\ndt = 0.1") + OTHER_PARTS)
+    scene = lj.load_scene(files / "scene.toml")
+    with pytest.raises(
+        lj.InputError, match=r"parameter set 1 \(counted from 0\): traction.0 history .* increasing times"
+    ):
+        lj.simulate_batch(scene, {"traction.0.times.1": jnp.array([0.1, -0.1])})
+
+
+def test_check_of_a_batch_names_run_and_step():
+    """The place in the table of runs and steps was given as the number of a step, here 4."""
+    codes = np.full((3, 2), status.CONVERGED)
+    codes[1, 1] = status.INVERTED
+    batch = Result(times=None, positions=None, reactions=None, status=codes, statistics=None)
+    with pytest.raises(RuntimeError, match=r"^run 1 \(counted from 0\), step 2: "):
+        batch.check()
+
+
 def test_rows_that_nothing_holds_are_refused(files):
     """Fibres of 5 cm and more support the body. With a larger rest length they are slack."""
     own = PARTS[PARTS.index("[[ligament]]") :].replace("pre_tension = 0.05", "rest_length = 0.04")
@@ -379,9 +399,9 @@ def test_what_cannot_be_resumed_is_refused(files, capsys):
         ("Law.mu\n700\n", "did you mean law.mu?"),
         ("law.mu [Pa]\n700\n", "did you mean law.mu?"),
         ("law.mu,\n700,\n", "column 2 has no name"),
-        ("mesh.points.0\n700\n", "'mesh.points.0' is a list in the scene file"),
-        ("mesh.points.0.1\n700\n", "only through all its positions together"),
-        ("mesh.cells.0\n3\n", "a mesh can be changed only through all its positions"),
+        ("mesh.points\n700\n", "'mesh.points' would change the mesh"),
+        ("mesh.points.0.1\n700\n", "which is the same in all runs of a sweep: remove this column"),
+        ("mesh.cells.0\n3\n", "'mesh.cells.0' would change the mesh"),
         ("fixed.0.nodes.0\n3\n", "is not a number of the scene file"),
         ("solve.tolerance\n0.1\n0\n", "row 2: .*tolerance = 0.0 must be above 0"),
     ],

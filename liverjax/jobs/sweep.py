@@ -78,6 +78,11 @@ class Done(NamedTuple):
 
 def _check_names(scene: Scene, parameters: Path, names: Sequence[str]) -> None:
     for name in names:
+        if name.split(".")[0] == "mesh":
+            raise InputError(
+                f"{parameters}: parameter {name!r} would change the mesh, which is the same in all runs of a sweep: "
+                "remove this column"
+            )
         try:
             shape = np.shape(numbers_at(scene, name))
         except InputError as error:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Indices, Number, param, replace, struct
+from liverjax.core.struct import Content, Indices, Number, param, replace, struct
 from liverjax.laws import Law
 from liverjax.laws.by_region import ByRegion
 from liverjax.mesh.adjacency import node_numbers
@@ -35,6 +35,8 @@ T = TypeVar("T")
 #: Error of a run, divided by the difference between its result and the result on the refined mesh. For second-order
 #: convergence, the error on the refined mesh is 1/4 of the error of the run.
 REFINED = 4 / 3
+#: Fields of an object in `scene.physics` that are vectors or histories, so they never have one number per triangle.
+_NOT_PER_TRIANGLE = ("times", "history", "position", "axis", "by", "force")
 
 
 @struct
@@ -67,7 +69,8 @@ def can_be_refined(scene: Scene) -> bool:
         triangles = getattr(physics, "triangles", None)
         if triangles is None:
             return not (isinstance(physics, Vessel) and isinstance(physics.enters, jax.core.Tracer))
-        others = jax.tree.leaves(replace(physics, triangles=None))
+        left_out: Content = {name: None for name in ("triangles", *_NOT_PER_TRIANGLE) if hasattr(physics, name)}
+        others = jax.tree.leaves(replace(physics, **left_out))
         return all(jnp.shape(leaf)[:1] != (len(triangles),) for leaf in others)
 
     fluid = scene.porosity

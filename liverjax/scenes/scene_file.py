@@ -413,6 +413,8 @@ def _read_body(table: dict) -> Body:
     given = _history("[body]", table)
     if "gravity" in table and given and given["history"].ndim == 2:
         raise InputError("[body] has gravity and a history of gravity vectors: remove one of them")
+    if "gravity" not in table and given and given["history"].ndim == 1:
+        raise InputError("[body] history contains factors that multiply gravity, but gravity is missing: give gravity")
     mass = table.get("mass", Body.mass)
     return Body(density=density, gravity=jnp.asarray(gravity), mass=mass, **given)
 

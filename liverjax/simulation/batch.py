@@ -14,6 +14,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, static, struct
+from liverjax.scenes.checks.choices import check_choices
 from liverjax.scenes.checks.numbers import check_bounds
 from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.scenes.scene_checks import check_before_run
@@ -112,7 +113,8 @@ def _lanes(parameters: dict[str, jax.Array]) -> int:
     return int(lengths[first] or 0)
 
 
-#: If the parameters change only numbers of these tables, the sets after the first one are checked only for bounds.
+#: If the parameters change only numbers of these tables, the sets after the first one are checked only for bounds and
+#: for numbers that exclude each other, for example times that do not increase.
 _MATERIAL = ("law", "viscosity", "porosity", "body", "region", "traction", "solve")
 
 
@@ -127,12 +129,17 @@ def _checked_lanes(scene: Scene, parameters: dict[str, jax.Array]) -> list[dict[
         return []
     on_host = {name: np.asarray(value) for name, value in parameters.items()}
     lanes = [{name: value[k] for name, value in on_host.items()} for k in range(_lanes(parameters))]
-    # For moduli, densities and loads, a check of the bounds is enough. Positions and directions need all checks.
+    # For moduli, densities and loads, checks of bounds and histories are enough. Positions and directions need all
+    # checks.
     placed = any(name.split(".")[0] not in _MATERIAL for name in on_host)
     for k, values in enumerate(lanes):
         own = with_parameters(scene, values)
         try:
-            check_before_run(own) if k == 0 or placed else check_bounds(own)
+            if k == 0 or placed:
+                check_before_run(own)
+            else:
+                check_choices(own)  # for example, the times of a history must increase
+                check_bounds(own)
         except InputError as error:
             raise InputError(f"parameter set {k} (counted from 0): {error}") from None
     return lanes

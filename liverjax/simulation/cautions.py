@@ -22,6 +22,7 @@ from liverjax.physics.contact.pressed import PressedObstacle
 from liverjax.physics.elastic_support import ElasticSupport
 from liverjax.physics.inertia import Inertia, inertia_forces
 from liverjax.physics.loads import dead_loads, follows
+from liverjax.physics.porosity import law_in_force
 from liverjax.physics.rigid_plate import RigidPlate
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.scenes import regions
@@ -358,8 +359,8 @@ def of_drained_layer(scene: Scene, seconds: float, when: str) -> list[str]:
 
     In a time t, a layer of the thickness sqrt(c t) drains, with the diffusivity c = kappa / (1/K_lim + 1/M) (Biot
     1941). kappa is the permeability, and 1/K_lim is the storage (see `liverjax.physics.porosity`). M = K0 + 4/3 mu,
-    with the drained bulk modulus K0 and the shear modulus mu. The pressure is linear in an element, so an element
-    thicker than this layer loses too much fluid.
+    with the bulk modulus K0 of the drained body (sponge and law) and the shear modulus mu. The pressure is linear in
+    an element, so an element thicker than this layer loses too much fluid.
     """
     sponge = scene.porosity
     assert sponge is not None
@@ -400,8 +401,8 @@ def _moduli_and_permeability(scene: Scene, at: np.ndarray) -> tuple[float, float
         shape = np.broadcast_shapes(np.shape(value), (scene.mesh.number_of_elements,))
         return float(np.median(np.broadcast_to(value, shape)[..., at]))
 
-    M = there(sponge.bulk) + 4 / 3 * there(own.law.shear_modulus())
-    return M, there(sponge.limit_bulk), there(sponge.permeability)
+    K0 = there(sponge.bulk) + there(law_in_force(sponge, own.law).bulk_modulus())
+    return K0 + 4 / 3 * there(own.law.shear_modulus()), there(sponge.limit_bulk), there(sponge.permeability)
 
 
 #: A warning is given if the overshoot, divided by the largest pressure of the step, exceeds this value.
@@ -454,13 +455,12 @@ def _of_overshoot(scene: Scene, P: np.ndarray) -> list[str]:
         M, _, kappa = _moduli_and_permeability(scene, at)
     except InputError:  # a law may have no moduli
         return [f"{said}: use a larger dt, or thinner elements there"]
-    flow = kappa * M
-    enough = _FOLLOWS * height**2 / flow
+    enough = _FOLLOWS * height**2 / (kappa * M)
     if float(scene.solve.dt) >= enough:  # then short steps are not the cause
         return []
     return [
         f"{said}: use a dt of {enough:.2g} s or more, or elements of "
-        f"{np.sqrt(float(scene.solve.dt) * flow / _FOLLOWS):.2g} m there (the elements are {height:.2g} m thick)"
+        f"{height * np.sqrt(float(scene.solve.dt) / enough):.2g} m there (the elements are {height:.2g} m thick)"
     ]
 
 

@@ -38,9 +38,11 @@ class Result:
     def check(self) -> "Result":
         """Return this result, or raise `RuntimeError` with advice if a step failed."""
         codes = np.asarray(self.status)
-        if np.any(codes != status.CONVERGED):
-            step = int(np.argmax(codes != status.CONVERGED))
-            raise RuntimeError(f"step {step + 1}: {status.advice(codes.ravel()[step])}")
+        failed = np.argwhere(codes != status.CONVERGED)
+        if len(failed):
+            first = tuple(failed[0])
+            run = f"run {', '.join(map(str, first[:-1]))} (counted from 0), " if len(first) > 1 else ""
+            raise RuntimeError(f"{run}step {first[-1] + 1}: {status.advice(codes[first])}")
         return self
 
 

@@ -308,8 +308,11 @@ def _small(scene: Scene, mass: str) -> Scene:
         sponge = replace(sponge, inlet=inlets)
     physics = tuple(without_history(own) for own in scene.physics)
     scene = replace(scene, traction=traction, body=body, solve=solve, porosity=sponge, physics=physics)
-    if scene.springpots is not None:
-        for law in laws_of(scene.law, scene.region):
-            check_springpots(scene.springpots, law, scene.viscosity)
-        scene = replace(scene, viscosity=series_at_rest(scene.springpots), springpots=None)
-    return prepared(scene)
+    if scene.springpots is None:
+        return prepared(scene)
+    for law in laws_of(scene.law, scene.region):
+        check_springpots(scene.springpots, law, scene.viscosity)
+    # The ratio 1 - spring may be 1 or negative, which `prepared` does not accept. So this ratio is set afterwards.
+    series = series_at_rest(scene.springpots)
+    scene = prepared(replace(scene, viscosity=replace(series, ratios=jnp.zeros(1)), springpots=None))
+    return replace(scene, viscosity=replace(series, ratios=series.ratios.astype(scene.mesh.points.dtype)))

@@ -33,7 +33,8 @@ def under_its_weight(scene: Scene) -> jax.Array | None:
     NaN if no state of rest is found.
 
     Raises:
-        InputError: no state of rest was found (outside jit, grad and vmap).
+        InputError: no state of rest was found (outside jit, grad and vmap), or springpots without a spring leave no
+            shear stiffness at rest.
     """
     body = None if scene.body is None else replace(scene.body, times=None, history=None)
     changed: Content = {"body": body, "porosity": _without_inflow(scene.porosity)}
@@ -41,6 +42,7 @@ def under_its_weight(scene: Scene) -> jax.Array | None:
     still = resting(replace(by_element(scene), traction=(), **changed))
     if not (_is_heavy(scene) or _is_pulled(still)):
         return None
+    _check_spring(scene)
     # In a porous body the time step is so long that the flow ends within one step.
     dt = None if scene.porosity is None else _FOR_LONG
     solve = replace(still.solve, dt=dt, steps=4, frequencies=None)
@@ -55,6 +57,16 @@ def under_its_weight(scene: Scene) -> jax.Array | None:
             f"no state of rest under gravity or tension was found ({error}): fix the body, or give a state "
             "of rest as the argument 'about'"
         ) from None
+
+
+def _check_spring(scene: Scene) -> None:
+    """Raise InputError if the springpots have no spring, so that the body has no shear stiffness at rest."""
+    spring = None if scene.springpots is None else scene.springpots.spring
+    if spring is not None and not isinstance(spring, jax.core.Tracer) and not np.any(np.asarray(spring)):
+        raise InputError(
+            "springpots.spring = 0 leaves no shear stiffness at rest, so the body has no state of rest under gravity "
+            "or tension: give spring above 0, remove the gravity, or give a state of rest as the argument 'about'"
+        )
 
 
 def without_history(physics: Physics) -> Physics:
@@ -86,7 +98,9 @@ def _is_pulled(still: Scene) -> bool:
     return whether the scene has a ligament."""
     if not still.physics:
         return False
-    alone = replace(still, fixed=(), displaced=(), body=None, porosity=None)
+    # The relaxed law may have no stiffness left (springpots with spring = 0), so the law before relaxation is used.
+    law = still.law if still.unrelaxed is None else still.unrelaxed
+    alone = replace(still, law=law, unrelaxed=None, fixed=(), displaced=(), body=None, porosity=None)
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((alone, still.fixed))):
         return any(isinstance(physics, Ligament) for physics in still.physics)
     alone = prepared(replace(alone, solve=Solve(volumetric=still.solve.volumetric)))
