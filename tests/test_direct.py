@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.sparse
 
 import liverjax as lj
 from liverjax.__main__ import main
@@ -218,3 +219,11 @@ def test_the_command_chooses_by_the_numbers_of_the_scene(tmp_path):
     with h5py.File(tmp_path / "result.h5") as result:
         assert result.attrs["iterations"].sum() > 0
         assert result.attrs["linear_iterations"].sum() == 0
+
+
+def test_rank_one_changes_in_single_precision():
+    """SuperLU refused the vectors of a pressed obstacle, which were in float64 beside a matrix in float32."""
+    A = scipy.sparse.csr_array(np.array([[4.0, 1, 0], [1, 3, 1], [0, 1, 5]], np.float32))
+    H, size, b = np.array([[1.0], [0.5], [0.0]]), np.array([2.0]), np.array([1.0, 2.0, 3.0], np.float32)
+    x = direct._solution(direct._factorised(A, np.ones(3), (None, 1.0), (H, size)), b)
+    assert x.dtype == np.float32 and np.allclose((A.toarray() - H @ H.T / size) @ x, b, rtol=1e-6)

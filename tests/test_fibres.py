@@ -9,6 +9,7 @@ import pytest
 
 import liverjax as lj
 from liverjax.elements import mjed, reference
+from liverjax.scenes.by_element import law_of_elements
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -153,3 +154,17 @@ def test_the_same_fibre_law_twice_is_twice_the_law():
     F = jnp.eye(3) + 0.1 * jnp.asarray(np.random.default_rng(1).standard_normal((3, 3)))
     assert np.allclose((law + law).first_piola(F), 2 * law.first_piola(F), rtol=1e-12)
     assert np.allclose((law + law).tangent(F), 2 * law.tangent(F), rtol=1e-12)
+
+
+def test_directions_in_a_body_of_three_elements():
+    """One direction (3,) was regarded as a number of each element, and three directions (3, 3) as columns."""
+    points = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1]]
+    mesh = lj.tet_mesh(np.array(points, float), [[0, 1, 2, 5], [0, 1, 5, 4], [0, 4, 5, 3]])
+    F, a = np.diag([1.1, 0.9, 1.0]), np.array([1.0, 0.2, 0.0])
+    one, array = (lj.laws.Costa(**COSTA, fibre=fibre) for fibre in (tuple(a), jnp.asarray(a)))
+    each = lj.laws.Costa(**COSTA, fibre=np.tile(a, (3, 1)), sheet=np.tile([0.0, 1.0, 0.0], (3, 1)))
+    whole = mjed.energy(mesh, one, mesh.points @ F)
+    for law in (array, each):
+        split = law_of_elements(law, (lj.Region(elements=jnp.array([1]), law=law),), 3)
+        for body, own in ((lj.quadratic(mesh), law), (mesh, split)):
+            assert np.isclose(mjed.energy(body, own, body.points @ F), whole, rtol=1e-12)

@@ -351,3 +351,16 @@ def test_volumes_of_several_kinds_are_not_mixed():
 def test_numbers_out_of_bounds_have_their_place():
     with pytest.raises(lj.InputError, match=r"region\.0\.law\.bulk"):
         lj.check_scene(pulled("static", lambda e: lj.Region(elements=e, law=dataclasses.replace(LIVER, bulk=-1.0))))
+
+
+def test_terms_of_a_law_are_not_values_of_elements():
+    """In a body of two elements, each element had one of the two terms of a law with arrays."""
+    points = 0.1 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
+    mesh, numbers = lj.tet_mesh(points, [[0, 1, 2, 3], [1, 2, 3, 4]]), ([700.0, -40.0], [2.5, -4.0])
+    fine, F = lj.quadratic(mesh), np.eye(3) + 0.1 * np.arange(9).reshape(3, 3) / 9
+    for of in (np.array, jnp.array):
+        law, same = (lj.laws.Ogden(mu=m, alpha=a, bulk=7000.0) for m, a in (map(of, numbers), map(tuple, numbers)))
+        split = law_of_elements(law, (lj.Region(elements=jnp.array([1]), law=law),), 2)
+        for body, own in ((fine, law), (mesh, split)):
+            whole = mjed.energy(body, same, body.points @ F.T)
+            assert np.isclose(mjed.energy(body, own, body.points @ F.T), whole, rtol=1e-12)

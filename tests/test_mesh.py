@@ -139,6 +139,21 @@ def test_meshes_refined_near_nodes_are_whole(shape):
     assert lj.refined(lj.quadratic(SHAPES[shape]()), near=[0]).order == 2
 
 
+def test_triangles_inside_the_body_are_refined():
+    """Only the new surface was searched for parts of these triangles, so the refined set was empty."""
+    mesh = lj.shapes.box((3, 3, 3), (3, 3, 3))
+    tets, centre = np.asarray(mesh.tetrahedra), np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)].mean(axis=1)
+    brick = lj.tet_mesh(mesh.points, tets[np.all((centre > 1) & (centre < 2), axis=1)])
+    skin = jnp.asarray(lj.boundary.boundary_triangles(brick))
+    mesh = replace(mesh, triangle_sets={"tumour": skin}, node_sets={"tumour": jnp.unique(skin)})
+    for near, count in ((None, 48), (skin[0], None)):
+        fine = refined(mesh, near)
+        parts = np.asarray(fine.points)[np.asarray(fine.triangle_sets["tumour"])]
+        area = np.linalg.norm(np.cross(parts[:, 1] - parts[:, 0], parts[:, 2] - parts[:, 0]), axis=1).sum() / 2
+        assert np.isclose(area, 6.0) and len(parts) == (count or len(parts))
+    assert len(lj.quadratic(refined(mesh)).node_sets["tumour"]) == 98
+
+
 def _area(mesh: lj.TetMesh) -> float:
     corners = np.asarray(mesh.points)[lj.boundary.boundary_triangles(mesh)]
     return float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum())

@@ -476,3 +476,12 @@ def test_points_in_quadratic_elements_move_with_their_functions():
     field = np.asarray(MESH.points) ** 2 @ np.array([1.0, -2.0, 0.5])
     assert np.allclose(np.sum(weights * field[nodes], axis=1), at**2 @ [1.0, -2.0, 0.5], atol=1e-16)
     assert np.all(outside == 0)
+
+
+@pytest.mark.parametrize("suffix", [".mesh", ".xdmf"])
+def test_quadratic_meshes_are_not_written_in_formats_without_them(suffix, tmp_path):
+    """The file had no tetrahedra, or could not be read again."""
+    mesh = lj.quadratic(lj.shapes.box((1, 1, 1), (1, 1, 1)))
+    with pytest.raises(lj.InputError, match=f"quadratic mesh cannot be written in the format {suffix}: write a .vtu"):
+        lj.write_mesh(tmp_path / f"body{suffix}", mesh)
+    assert not list(tmp_path.iterdir())

@@ -297,6 +297,25 @@ def test_a_body_at_rest_converges_and_has_no_error_to_state(trained):
     assert stated(0.0) == 0 and jax.grad(stated)(0.0) == 0
 
 
+def test_a_model_of_the_first_rows_is_kept_if_all_later_runs_fail(monkeypatch):
+    """The four runs that converged were lost, with the message that none of the 2 runs converged."""
+    monkeypatch.setattr(training, "_model_of", lambda scene, runs, *settings: runs)
+    monkeypatch.setattr(training, "_errors_of_rows", lambda model, scene, rows: np.arange(4.0))
+    scene = _bar((3, 1, 1), solve=lj.Solve(newton_iterations=8))
+    g = [-0.1, -0.2, -0.15, -0.25, -300.0, -310.0, -320.0, -330.0]
+    with pytest.warns(UserWarning, match="2 of 2 training runs failed"):
+        runs = lj.reduce_scene(scene, {"body.gravity.2": g}, runs=6)
+    assert runs.values["body.gravity.2"].tolist() == g[:4] and len(runs.u) == 4
+
+
+def test_rows_with_other_meshes_are_refused():
+    """The modes were computed from positions minus the positions of another mesh."""
+    scene = _bar((3, 1, 1))
+    points = np.asarray(scene.mesh.points)
+    with pytest.raises(lj.InputError, match=r"remove the column mesh\.points"):
+        lj.reduce_scene(scene, {"mesh.points": np.stack([points, 1.1 * points])})
+
+
 @pytest.mark.slow
 def test_rows_of_the_largest_stated_errors_are_run():
     """Some parameter sets are close to each other, others are far away. The far ones are run, so their range is

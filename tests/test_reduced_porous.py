@@ -12,6 +12,7 @@ import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.core.struct import replace
 from liverjax.jobs import reduction
+from liverjax.laws.base import Volumetric
 from liverjax.mesh.nodal import integrals, nodal_volumes
 from liverjax.physics.porosity import Inlet
 from liverjax.reduced import step, training
@@ -298,3 +299,18 @@ def test_the_commands_make_and_use_a_porous_model(tmp_path, capsys):
     (tmp_path / "used.toml").write_text(SCENE + 'reduced = "model.h5"\n' + between)
     assert main(["simulate", str(tmp_path / "used.toml"), "--out", str(tmp_path / "used")]) == 0
     assert "the full model runs" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_regions_change_the_law_before_its_volumetric_energy_is_removed(several):
+    """The law without U(J) had no `bulk`, and the second term of a sum was changed instead of the first."""
+    scene, mu = _sponge((2, 1, 1)), np.where(np.arange(12) < 4, 1600.0, 800.0)
+    changes = {"mu": 1600.0, "bulk": 6000.0}
+    if several:
+        law = Volumetric(bulk=3000.0) + lj.laws.NeoHookean(mu=800.0, bulk=1.0) + lj.laws.typical("arruda_boyce")
+        scene, changes = replace(scene, law=law), {"1.mu": 1600.0}
+    scene = replace(scene, region=(lj.Region(elements=jnp.arange(4), law=changes),))
+    model = with_all_points(scene, jnp.zeros((1, len(scene.mesh.points), 3)))
+    first, *others = solid_at_points(model, scene).law.summands()
+    assert first.mu.tolist() == mu.tolist() and first.bulk is None
+    assert all(jnp.ndim(own.mu) == 0 for own in others) and len(others) == several

@@ -129,3 +129,9 @@ def test_scenes_with_time_and_values_outside_are_refused(scene, model):
         lj.separated_displacement(model, {"law.mu": 500.0, "body.gravity.2": -1.0})
     with pytest.raises(lj.InputError, match=r"add or remove the value of body\.gravity\.2"):
         lj.separated_displacement(model, {"law.mu": 700.0})
+
+
+def test_a_body_that_does_not_move_is_refused(scene):
+    """The error of the terms was 0/0."""
+    with pytest.raises(lj.InputError, match="no training run moves the body"):
+        lj.separate(replace(scene, body=None), {"law.mu": (600.0, 900.0)}, points=2, checks=1)

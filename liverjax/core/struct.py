@@ -61,6 +61,7 @@ def param(
         unit: SI unit, ``"1"`` for a pure number. `liverjax.laws.scaled` multiplies all fields in ``Pa``.
         about: one line for ``python -m liverjax laws``.
         each: whether the value is a sequence: one number for each term of a law, or the components of a direction.
+            The struct keeps an array (n,) as a tuple.
         typical: value for a soft tissue with a shear modulus of about 1 kPa. It is used if a user gives only the name
             of a law.
         default: see `dataclasses.field`.
@@ -100,6 +101,9 @@ def struct(cls: type[T]) -> type[T]:
     fields = dataclasses.fields(made)
     if any(f.name in _WHOLE | _FLOATING for f in fields):
         made.__init__ = _with_arrays(made.__init__)
+    several = frozenset(f.name for f in fields if f.metadata.get("each"))
+    if several:
+        made.__init__ = _with_tuples(made.__init__, several)
     meta = tuple(f.name for f in fields if f.metadata.get("static"))
     data = tuple(f.name for f in fields if not f.metadata.get("static"))
     keys = tuple(jax.tree_util.GetAttrKey(name) for name in data)
@@ -143,6 +147,24 @@ def _with_arrays(make: Callable[..., None]) -> Callable[..., None]:
     def init(self: object, **given: object) -> None:
         lists = {k: v for k, v in given.items() if k in _WHOLE | _FLOATING and isinstance(v, list)}
         make(self, **given | {name: converted(name, value) for name, value in lists.items()})
+
+    return init
+
+
+def _with_tuples(make: Callable[..., None], several: frozenset[str]) -> Callable[..., None]:
+    """Return the method `make` (__init__ of a struct), changed such that it first converts arrays (n,) to tuples.
+
+    Otherwise, n numbers of a law could be mistaken for one number of each element in a body of n elements.
+
+    Args:
+        make: the method.
+        several: names of the fields that are sequences (`each` of `param`).
+    """
+
+    @functools.wraps(make)
+    def init(self: object, **given: object) -> None:
+        rows = {k: v for k, v in given.items() if k in several and isinstance(v, Array) and v.ndim == 1}
+        make(self, **given | {name: tuple(value) for name, value in rows.items()})
 
     return init
 

@@ -318,10 +318,22 @@ def _are_whole(values: np.ndarray) -> bool:
     return np.issubdtype(values.dtype, np.integer)
 
 
+#: File formats in which meshio does not write quadratic tetrahedra, or does not read them again.
+_LINEAR_ONLY = (".mesh", ".meshb", ".xdmf", ".xmf", ".ugrid", ".node", ".ele")
+
+
 def write_mesh(path: str | os.PathLike, mesh: TetMesh, point_data: Mapping[str, object] | None = None) -> None:
-    """Write a mesh [m] with meshio. In formats that can store data, sets are written as 0/1 data ``set:NAME``."""
+    """Write a mesh [m] with meshio. In formats that can store data, sets are written as 0/1 data ``set:NAME``.
+
+    Raises:
+        InputError: the mesh is quadratic, but the format has no quadratic tetrahedra (`_LINEAR_ONLY`).
+    """
     import meshio
 
+    if mesh.order > 1 and Path(path).suffix.lower() in _LINEAR_ONLY:
+        raise InputError(
+            f"{path}: a quadratic mesh cannot be written in the format {Path(path).suffix.lower()}: write a .vtu file"
+        )
     data = {name: np.asarray(values) for name, values in (point_data or {}).items()}
     for name, nodes in mesh.node_sets.items():
         data[f"set:{name}"] = _mask(nodes, mesh.number_of_nodes)

@@ -7,7 +7,7 @@ import numpy as np
 from liverjax.core.struct import Array, Indices, replace
 from liverjax.mesh.adjacency import PAIRS, node_numbers
 from liverjax.mesh.promotion import middles_of_set, quadratic
-from liverjax.mesh.selection import boundary_triangles, check_nodes
+from liverjax.mesh.selection import boundary_triangles, check_nodes, face_codes
 from liverjax.mesh.shape_functions import FACES
 from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
@@ -51,8 +51,8 @@ def refined(mesh: TetMesh, near: Indices | None = None) -> TetMesh:
     made = tet_mesh(stack([points, 0.5 * (points[low] + points[high])[halved]]), tets, sets, elements)
     if mesh.triangle_sets:
         ends = np.hstack([np.tile(np.arange(V), (2, 1)), np.stack([low, high])[:, halved]])
-        surface = boundary_triangles(made)
-        groups = {name: _triangles_in(np.asarray(old), surface, ends) for name, old in mesh.triangle_sets.items()}
+        faces = _all_faces(made)
+        groups = {name: _triangles_in(np.asarray(old), faces, ends) for name, old in mesh.triangle_sets.items()}
         made = replace(made, triangle_sets=groups)
     return quadratic(made) if mesh.order > 1 else made
 
@@ -107,15 +107,24 @@ def _places_of_parts() -> np.ndarray:
     return _corners_of_parts(*np.eye(4), *(np.eye(4)[[i, j]].mean(axis=0) for i, j in PAIRS))
 
 
-def _triangles_in(triangles: np.ndarray, surface: np.ndarray, ends: np.ndarray) -> jax.Array:
-    """Return the triangles of the new surface that lie in old triangles (m, 3).
+def _all_faces(mesh: TetMesh) -> np.ndarray:
+    """Return the faces (m, 3) of all elements, each face once. Normals of faces on the surface point outward."""
+    tets = np.asarray(mesh.tetrahedra)
+    faces = np.concatenate([tets[:, f] for f in FACES])
+    codes = face_codes(np.sort(faces.astype(np.int64), axis=1), mesh.number_of_vertices)
+    return faces[np.sort(np.unique(codes, return_index=True)[1])]
+
+
+def _triangles_in(triangles: np.ndarray, faces: np.ndarray, ends: np.ndarray) -> jax.Array:
+    """Return the new faces (n, 3) that lie in old triangles (m, 3). Old triangles may lie inside the body.
 
     `ends` (2, V): for each new vertex, the two ends of the old edge with this vertex at its middle. For an old vertex,
     both entries are the vertex itself.
     """
     old = {tuple(corners) for corners in np.sort(triangles, axis=1).tolist()}
-    of_each = np.moveaxis(ends[:, surface], 0, 1).reshape(len(surface), -1).tolist()
-    return node_numbers(surface[[tuple(sorted(set(own))) in old for own in of_each]])
+    near = faces[np.isin(ends[:, faces], triangles).all(axis=(0, 2))]
+    of_each = np.moveaxis(ends[:, near], 0, 1).reshape(len(near), -1).tolist()
+    return node_numbers(near[np.array([tuple(sorted(set(own))) in old for own in of_each], bool)])
 
 
 def rim(mesh: TetMesh, nodes: Indices) -> np.ndarray:

@@ -27,7 +27,7 @@ from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import Physics
 from liverjax.physics.elasticity import Elasticity
 from liverjax.physics.loads import follows
-from liverjax.physics.registry import law_at_rest
+from liverjax.physics.porosity import law_in_force
 from liverjax.physics.viscosity import Viscoelasticity
 from liverjax.reduced.correction import Correction
 from liverjax.reduced.physics.supports import identity_of_supports, refuse_other_physics
@@ -136,7 +136,7 @@ def solid_at_points(model: ReducedModel, scene: Scene) -> Physics:
     """Return the physics object for elasticity or viscoelasticity, as in the full model, with the law's parameters at
     the sampled points."""
     E = scene.mesh.number_of_elements
-    law = law_of_elements(law_at_rest(scene), scene.region, E)
+    law = law_in_force(scene.porosity, law_of_elements(scene.law, scene.region, E))
     elements = model.points % E
     law = jax.tree.map(lambda a: jnp.asarray(a)[elements] if jnp.shape(a) in ((E,), (E, 3)) else a, law)
     assert isinstance(law, Law)

@@ -21,6 +21,7 @@ from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, replace, static, struct
 from liverjax.mesh.nodal import nodal_volumes
+from liverjax.reduced.training import refuse_rest
 from liverjax.scenes.checks.numbers import check_numbers
 from liverjax.scenes.scene import Scene, numbers_at, with_parameters
 from liverjax.simulation.batch import simulate_batch
@@ -71,7 +72,7 @@ def separate(
 
     Raises:
         InputError: the scene has a time step, a range cannot be used, too many runs are needed, or a run did not
-            converge.
+            converge, or no run of the grid moves the body.
     """
     names, limits = _names_and_limits(scene, ranges, points)
     t = np.cos(np.pi * (np.arange(points) + 0.5) / points)  # Chebyshev's points in (-1, 1)
@@ -79,6 +80,7 @@ def separate(
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(names))
     between = limits[:, 0] + np.random.default_rng(0).random((checks, len(names))) * np.ptp(limits, axis=1)
     u = _displacements(scene, names, np.concatenate([grid, between]))
+    refuse_rest(scene, u[: len(grid)])
     roots = np.sqrt(np.repeat(np.asarray(nodal_volumes(scene.mesh)), 3))
     known, unseen = u[: len(grid)].reshape(len(grid), -1) * roots, u[len(grid) :]
     shape = (points,) * len(names)

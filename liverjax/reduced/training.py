@@ -56,11 +56,13 @@ def reduce_scene(
             the motions [1]. Default: `tolerance`.
         runs: number of full runs. Two thirds of them use the first rows. A preliminary reduced model is made from these
             two thirds. The last third uses the remaining rows with the largest corrections of this model, relative to
-            the displacements (if the model has no correction: the largest displacements). Default: all rows.
+            the displacements (if the model has no correction: the largest displacements). If none of the last third
+            converges, the result is the preliminary model. Default: all rows.
 
     Raises:
         InputError: the scene has entries that reduced models do not support; a tolerance is not between 0 and 1; no run
-            converged, or none moves the body; `runs` does not fit the number of rows; `rows` contains solve.dt.
+            converged, or none moves the body; `runs` does not fit the number of rows; `rows` contains solve.dt or a
+            number of the mesh.
     """
     refuse_unknown_physics(scene)
     point_tolerance = tolerance if point_tolerance is None else point_tolerance
@@ -68,28 +70,50 @@ def reduce_scene(
         if not 0 < value < 1:
             raise InputError(f"{name} = {value} must be between 0 and 1: give e.g. 1e-4")
     values = {name: np.asarray(value, float) for name, value in rows.items()}
-    if "solve.dt" in values:
-        raise InputError(
-            "all runs of a reduced model must have the same time step dt: remove the column solve.dt, and give dt in "
-            "[solve]"
-        )
+    _refuse_other_bodies(values)
     count = len(next(iter(values.values()), ()))
     runs = count if runs is None else runs
     if not FEWEST_RUNS <= runs <= count and runs != count:
         allowed = f"from {FEWEST_RUNS} to {count}" if count > FEWEST_RUNS else f"{count}"
         raise InputError(f"runs = {runs} must be {allowed} (the number of rows)")
-    if runs == count:
-        return _model_of(scene, _full_runs(scene, values), tolerance, most_modes, point_tolerance)
-    first = 2 * runs // 3
+    first = count if runs == count else 2 * runs // 3
     own = _full_runs(scene, _some(values, slice(first)))
+    if not len(own.u):
+        raise InputError(f"none of the {first} runs converged: give smaller loads, or more steps")
+    refuse_rest(scene, own.u)
     model = _model_of(scene, own, tolerance, most_modes, point_tolerance)
+    if runs == count:
+        return model
     others = _some(values, slice(first, None))
     far = np.argsort(_errors_of_rows(model, scene, others))[::-1][: runs - first]
     more = _full_runs(scene, _some(others, far))
+    if not len(more.u):
+        return model
     values = {name: np.concatenate([own.values[name], more.values[name]]) for name in values}
     P = None if own.P is None or more.P is None else np.concatenate([own.P, more.P])
     both = _Runs(values, np.concatenate([own.u, more.u]), P)
     return _model_of(scene, both, tolerance, most_modes, point_tolerance)
+
+
+def _refuse_other_bodies(values: Mapping[str, np.ndarray]) -> None:
+    """Raise InputError if the values would give the runs different time steps or different meshes."""
+    if "solve.dt" in values:
+        raise InputError(
+            "all runs of a reduced model must have the same time step dt: remove the column solve.dt, and give dt in "
+            "[solve]"
+        )
+    for name in values:
+        if name.startswith("mesh."):
+            raise InputError(
+                f"all runs of a reduced model must have the same mesh: remove the column {name}, and make one model "
+                "for each mesh"
+            )
+
+
+def refuse_rest(scene: Scene, u: np.ndarray) -> None:
+    """Raise InputError if the displacements u (…, V, 3) [m] of all runs are 0, apart from roundoff."""
+    if np.abs(u).max() <= _ROUNDOFF * np.ptp(np.asarray(scene.mesh.points)):
+        raise InputError("no training run moves the body: give loads or prescribed motions that are not 0")
 
 
 def _some(values: Mapping[str, np.ndarray], which: slice | np.ndarray) -> dict[str, np.ndarray]:
@@ -101,10 +125,9 @@ def _words_of(row: Mapping[str, np.ndarray]) -> str:
 
 
 def _full_runs(scene: Scene, values: dict[str, np.ndarray]) -> _Runs:
+    """Return the runs that converged, and warn of the others."""
     result = simulate_batch(scene, dict(values)).result
     good = np.all(np.asarray(result.status) == status.CONVERGED, axis=1)
-    if not good.any():
-        raise InputError(f"none of the {len(good)} runs converged: give smaller loads, or more steps")
     if not good.all():
         warnings.warn(
             f"{np.sum(~good)} of {len(good)} training runs failed and are left out (the first has "
@@ -116,8 +139,6 @@ def _full_runs(scene: Scene, values: dict[str, np.ndarray]) -> _Runs:
     u = np.asarray(result.positions)[good]
     u -= np.asarray(scene.mesh.points)
     u *= np.asarray(mask)
-    if np.abs(u).max() <= _ROUNDOFF * np.ptp(np.asarray(scene.mesh.points)):
-        raise InputError("no training run moves the body: give loads or prescribed motions that are not 0")
     P = None if result.pressure is None else np.asarray(result.pressure)[good, :, : scene.mesh.number_of_vertices]
     return _Runs(_some(values, good), u, P)
 

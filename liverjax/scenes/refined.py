@@ -107,7 +107,7 @@ def on_refined_mesh(scene: Scene) -> tuple[Scene, Within]:
         scene,
         mesh=mesh,
         law=_law_of_parts(E, scene.law),
-        viscosity=_series(E, scene.viscosity),
+        viscosity=_series(scene.viscosity),
         region=tuple(replace(r, elements=node_numbers(parts_of(r.elements))) for r in scene.region),
         porosity=_sponge(E, scene.porosity, more, parts),
         body=body,
@@ -147,9 +147,9 @@ def _of_parts(E: int, numbers: T) -> T:
 
     def one(a: Number) -> Number:
         shape = jnp.shape(a)
-        if shape[-1:] == (E,):
-            return jnp.repeat(jnp.asarray(a), 8, axis=-1)
-        return jnp.repeat(jnp.asarray(a), 8, axis=-2) if shape[-2:] == (E, 3) else a
+        if shape[-2:] == (E, 3):  # comes first, because a body of three elements has arrays (3, 3) of directions
+            return jnp.repeat(jnp.asarray(a), 8, axis=-2)
+        return jnp.repeat(jnp.asarray(a), 8, axis=-1) if shape[-1:] == (E,) else a
 
     return jax.tree.map(one, numbers)
 
@@ -165,15 +165,16 @@ def _law_of_parts(E: int, law: Law) -> Law:
     )
 
 
-def _series(E: int, prony: Prony | None) -> Prony | None:
+def _series(prony: Prony | None) -> Prony | None:
     """Return the Prony series for the refined mesh.
 
     Values (N, E) of N modes for each element are repeated for the eight parts of the element.
     """
     if prony is None:
         return None
-    by_element = {name: own for name in VISCOUS if np.ndim(own := getattr(prony, name)) == 2}
-    return replace(prony, **_of_parts(E, by_element))
+    series = {name: jnp.asarray(getattr(prony, name)) for name in VISCOUS}
+    parts: Content = {name: jnp.repeat(own, 8, axis=-1) for name, own in series.items() if own.ndim == 2}
+    return replace(prony, **parts)
 
 
 def _sponge(E: int, porosity: Porosity | None, more: Callable[[Indices], Indices], parts: Callable) -> Porosity | None:

@@ -215,7 +215,8 @@ def _factorised(A: "scipy.sparse.csr_array", free: np.ndarray, along: tuple, way
         )
     except (RuntimeError, ValueError):
         factor = None
-    return _Factor(keep, factor, (H, size))
+    # SuperLU accepts right-hand sides only in the precision of the matrix.
+    return _Factor(keep, factor, (H.astype(A.dtype), size))
 
 
 def _solution(own: _Factor, b: np.ndarray) -> np.ndarray:

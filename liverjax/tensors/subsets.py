@@ -54,9 +54,9 @@ def in_subset(s: Subsets, k: int, numbers: T) -> T:
 
     def one(a: Number) -> Number:
         shape = jnp.shape(a)
-        if shape[-1:] == (E,):
-            return jnp.asarray(a)[..., own]
-        return jnp.asarray(a)[..., own, :] if shape[-2:] == (E, 3) else a
+        if shape[-2:] == (E, 3):  # comes first, because a body of three elements has arrays (3, 3) of directions
+            return jnp.asarray(a)[..., own, :]
+        return jnp.asarray(a)[..., own] if shape[-1:] == (E,) else a
 
     return jax.tree.map(one, numbers)
 
