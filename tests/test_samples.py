@@ -189,6 +189,10 @@ def test_a_typical_sample_has_the_mean_equilibrium_modulus():
     assert not any("population mean" in w for w in samples_report.warnings(found))
     other = found._replace(typical=found.typical._replace(ratios=found.typical.ratios * 0.9))
     assert any("use the values of the population" in w for w in samples_report.warnings(other))
+    # A mode without a mean: the other ratio does not take its place.
+    without = {name: None if name == "ratios[1]" else p for name, p in found.populations.items()}
+    left = samples._typical_sample(sweeps, found.fits, without).ratios
+    assert len(left) == 1 and left[0] == pytest.approx(found.populations["ratios[0]"].mean)
 
 
 def test_an_exponent_of_a_new_sample_is_at_most_one(monkeypatch):

@@ -420,16 +420,20 @@ def test_arrays_of_nearly_known_names_are_told(tmp_path):
 def test_rounded_positions_are_on_the_grid(tmp_path):
     """A turn of the axes in single precision moves positions by nanometres. These were taken for steps of the grid."""
     index = np.stack(np.unravel_index(np.arange(5 * 6 * 7), (5, 6, 7)), axis=1)
+    once = np.zeros(len(index), int)
     exact, rng = index * np.array([0.002, 0.0025, 0.003]), np.random.default_rng(0)
     for jitter in (4e-9, 2e-5):
         places = exact + rng.uniform(-jitter, jitter, exact.shape)
-        at, spacing, _, shape = formats._grid(tmp_path, places)
+        at, spacing, _, shape = formats._grid(tmp_path, places, once)
         np.testing.assert_array_equal(at, index)
         np.testing.assert_allclose(spacing, [0.002, 0.0025, 0.003], rtol=0.01)
         assert shape == (5, 6, 7)
     apart = index + np.where(index[:, :1] > 2, [[60, 0, 0]], 0)  # two bodies, 60 voxels apart
-    at, spacing, _, shape = formats._grid(tmp_path, apart * 0.0015)
+    at, spacing, _, shape = formats._grid(tmp_path, apart * 0.0015, once)
     np.testing.assert_array_equal(at, apart)
     assert np.allclose(spacing, 0.0015) and shape == (65, 6, 7)
     with pytest.raises(InputError, match="is not on a regular grid"):
-        formats._grid(tmp_path, exact + rng.uniform(-2e-4, 2e-4, exact.shape))
+        formats._grid(tmp_path, exact + rng.uniform(-2e-4, 2e-4, exact.shape), once)
+    # Neighbouring rows of 1.3333 mm are rounded to 1.33 or 1.34 mm: not a grid of 0.01 mm.
+    rounded = np.round(index * 0.0013333 + rng.uniform(-4e-6, 4e-6, exact.shape), 5)
+    assert formats._grid(tmp_path, rounded, once)[3] == (5, 6, 7)

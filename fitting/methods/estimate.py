@@ -157,7 +157,7 @@ def wider(estimate: Estimate, direction: np.ndarray) -> Estimate:
 def without_part(error: float, part: float) -> float:
     """Return a standard error without one of its independent parts (difference of squares), or 0 if the part is
     larger."""
-    return float(np.sqrt(max(0.0, (error - part) * (error + part))))
+    return float(np.sqrt(np.maximum(0.0, (error - part) * (error + part))))
 
 
 def with_shared_errors(estimate: Estimate, other: Estimate) -> Estimate:

@@ -61,7 +61,7 @@ def param(
         unit: SI unit, ``"1"`` for a pure number. `liverjax.laws.scaled` multiplies all fields in ``Pa``.
         about: one line for ``python -m liverjax laws``.
         each: whether the value is a sequence: one number for each term of a law, or the components of a direction.
-            The struct keeps an array (n,) as a tuple.
+            The struct keeps an array (n,) as a tuple; `jnp.stack` makes it an array again.
         typical: value for a soft tissue with a shear modulus of about 1 kPa. It is used if a user gives only the name
             of a law.
         default: see `dataclasses.field`.

@@ -319,18 +319,21 @@ def _are_whole(values: np.ndarray) -> bool:
 
 
 #: File formats in which meshio does not write quadratic tetrahedra, or does not read them again.
-_LINEAR_ONLY = (".mesh", ".meshb", ".xdmf", ".xmf", ".ugrid", ".node", ".ele")
+_LINEAR_ONLY = (".mesh", ".meshb", ".ugrid", ".node", ".ele", ".h5m", ".f3grid")
+#: Formats in which meshio does not read quadratic triangles again.
+_NO_TRIANGLES = (".xdmf", ".xmf")
 
 
 def write_mesh(path: str | os.PathLike, mesh: TetMesh, point_data: Mapping[str, object] | None = None) -> None:
     """Write a mesh [m] with meshio. In formats that can store data, sets are written as 0/1 data ``set:NAME``.
 
     Raises:
-        InputError: the mesh is quadratic, but the format has no quadratic tetrahedra (`_LINEAR_ONLY`).
+        InputError: the mesh is quadratic, but the format has no quadratic tetrahedra (`_LINEAR_ONLY`) or triangles.
     """
     import meshio
 
-    if mesh.order > 1 and Path(path).suffix.lower() in _LINEAR_ONLY:
+    refused = _LINEAR_ONLY + (_NO_TRIANGLES if mesh.triangle_sets else ())
+    if mesh.order > 1 and Path(path).suffix.lower() in refused:
         raise InputError(
             f"{path}: a quadratic mesh cannot be written in the format {Path(path).suffix.lower()}: write a .vtu file"
         )

@@ -43,7 +43,7 @@ def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
     known = edges.values(fit)
     noise = {name: error for name, (_, error) in known.items()}
     gap, usual = fit.details.get("gap_error"), Simulation()
-    relative = fit.details.get("geometry_error", of_geometry(usual, gap and gap * usual.height))
+    relative = fit.details.get("geometry_error", of_geometry(usual, None if gap is None else gap * usual.height))
     moduli = edges.moduli_among(fit)
     out = {
         "noise": noise,

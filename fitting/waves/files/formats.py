@@ -6,6 +6,7 @@ of displacement, a file may have real and imag, phases (real values at instants 
 """
 
 import difflib
+import itertools
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -242,7 +243,6 @@ def _voxel_table(path: Path) -> Content:
         rows[k, : len(cells)] = cells
     column = dict(zip(head, rows.T, strict=True))
     places = _LENGTHS[units.get("x", "m")] * np.stack([column[a] for a in "xyz"], axis=1)
-    at, spacing, origin, shape = _grid(path, places)
     hertz, of = (None, np.zeros(len(rows), int))
     if "frequency" in column:
         empty = np.flatnonzero(~np.isfinite(column["frequency"]))
@@ -251,7 +251,8 @@ def _voxel_table(path: Path) -> Content:
                 f"{path}: row {lines[1 + empty[0]][0]} has no frequency; give a frequency in Hz in every row"
             )
         hertz, of = np.unique(column["frequency"], return_inverse=True)
-    if len(np.unique(np.column_stack([of, at]), axis=0)) < len(at):
+    at, spacing, origin, shape = _grid(path, places, of)
+    if not _all_differ(of, at):
         unknown = [name for name in head if name and name not in _KNOWN]
         perhaps = (
             f", or rename column {unknown[0]} to frequency if this column contains the frequencies" if unknown else ""
@@ -287,42 +288,50 @@ def _quick_number(text: str, between: str) -> float | None:
         return to_number(text, between)
 
 
-#: _JITTER: if the positions are on no regular grid, steps that are shorter than this fraction of the longest step are
-#: regarded as errors of the positions. _LONGEST: a grid cannot have more voxels along an axis. _UNEVEN: maximum
-#: distance of a position from the grid, divided by the spacing.
-_JITTER, _LONGEST, _UNEVEN = 0.05, 10_000, 0.05
+#: _JITTER: steps between positions that are shorter than this fraction of the longest step are regarded as errors of
+#: the positions, if this gives a regular grid. _UNEVEN: maximum distance of a position from the grid, divided by the
+#: spacing.
+_JITTER, _UNEVEN = 0.05, 0.05
 
 
-def _grid(path: Path, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]:
+def _grid(path: Path, X: np.ndarray, of: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]:
     """Return the grid indices (n, 3) of the points X (n, 3) [m], and the spacing [m], origin [m] and shape of their
-    regular grid."""
+    regular grid. `of` (n,): index of the frequency of each point."""
     if not np.all(np.isfinite(X)) or not len(X):
         raise InputError(
             f"{path}: the file has no rows, or some rows have no x, y, z; give the position of every voxel in metres"
         )
-    spacing, origin = np.empty(3), X.min(axis=0)
-    for a, axis in enumerate("xyz"):
-        found = _spacing_along(path, X[:, a] - origin[a], axis)
-        if found is None:
-            raise InputError(f"{path}: {axis} is not on a regular grid; give voxels with equal spacing")
-        spacing[a] = found
-    at = np.rint((X - origin) / spacing).astype(int)
-    return at, spacing, origin, tuple(int(n) for n in at.max(axis=0) + 1)
+    origin = X.min(axis=0)
+    regular = None
+    # Errors of positions have to be left out, but not the short steps in a body with wide gaps: there, different voxels
+    # would get the same index.
+    for least in itertools.product((_JITTER, 0.0), repeat=3):
+        spacing = np.array([_spacing_along(path, X[:, a] - origin[a], "xyz"[a], least[a]) for a in range(3)])
+        at = np.rint((X - origin) / spacing).astype(int)
+        off = np.abs(X - origin - at * spacing).max(axis=0) / spacing
+        if off.max() <= _UNEVEN:
+            regular = regular or (at, spacing, origin, tuple(int(n) for n in at.max(axis=0) + 1))
+            if _all_differ(of, at):
+                return at, spacing, origin, tuple(int(n) for n in at.max(axis=0) + 1)
+    if regular is None:
+        raise InputError(f"{path}: {'xyz'[int(off.argmax())]} is not on a regular grid; give voxels with equal spacing")
+    return regular
 
 
-def _spacing_along(path: Path, x: np.ndarray, axis: str) -> float | None:
-    """Return the spacing [m] of positions x (n,) along one axis, measured from the first one. Return None if they are
-    on no regular grid."""
+def _all_differ(of: np.ndarray, at: np.ndarray) -> bool:
+    """Return whether no voxel (row of `at`) has two rows for the same frequency `of`."""
+    return len(np.unique(np.column_stack([of, at]), axis=0)) == len(at)
+
+
+def _spacing_along(path: Path, x: np.ndarray, axis: str, least: float) -> float:
+    """Return the spacing [m] of positions x (n,) along one axis, measured from the first one. Steps shorter than the
+    fraction `least` of the longest step do not count."""
     steps = np.diff(np.unique(np.round(x, 9)))
     if not len(steps):
         raise InputError(f"{path}: all voxels have the same {axis}; waves need a volume, not a single slice")
-    for real in (steps, steps[steps > _JITTER * steps.max()]):
-        # Positions in a file are rounded, so the total length gives a more exact spacing than single steps.
-        number = np.rint(x.max() / real[real < 1.5 * real.min()].mean())
-        h = x.max() / number
-        if number < _LONGEST and np.abs(x - h * np.rint(x / h)).max() <= _UNEVEN * h:
-            return float(h)
-    return None
+    steps = steps[steps >= least * steps.max()]
+    # Positions in a file are rounded, so the total length gives a more exact spacing than single steps.
+    return float(x.max() / np.rint(x.max() / steps[steps < 1.5 * steps.min()].mean()))
 
 
 def _nifti(path: Path) -> Content:
