@@ -17,7 +17,17 @@ def order_of_steps(scene: Scene) -> int:
     different orders, the smallest order is returned."""
     dynamic_euler = scene.solve.kind == "dynamic" and scene.solve.integrator == "euler"
     old_recursion = scene.viscosity is not None and scene.viscosity.scheme == "backward_euler"
-    return 1 if dynamic_euler or old_recursion or scene.porosity is not None else 2
+    jump = scene.viscosity is not None and scene.solve.kind == "static" and _begins_with_load(scene)
+    return 1 if dynamic_euler or old_recursion or jump or scene.porosity is not None else 2
+
+
+def _begins_with_load(scene: Scene) -> bool:
+    """Return whether a load without a history acts from the first step on. It then rises during this step, so half the
+    step also halves the time of the rise."""
+    loads = [own.value for own in scene.traction if own.times is None]
+    if scene.body is not None and scene.body.times is None:
+        loads.append(scene.body.gravity)
+    return any(np.any(np.asarray(load) != 0) for load in loads)
 
 
 def change_with_small_steps(
