@@ -57,6 +57,14 @@ def test_a_tube_has_its_length_and_radius(path, closed, corners):
     assert far.max() < 0.4 * RADIUS
 
 
+@pytest.mark.parametrize(("length", "rings", "closed"), [(20, 4, False), (10, 2, False), (5, 2, True)])
+def test_a_tube_with_one_ring_left_is_refused(length, rings, closed):
+    """Long triangles leave one ring. Half of the centre line was lost, and the other half left the tube."""
+    path = np.linspace(0, length, rings)[:, None] * np.array([[1.0, 0.0, 0.0]])
+    with pytest.raises(lj.InputError, match="too short or too coarse"):
+        centre_lines(*tube(path, 12 if rings == 4 else 24, closed, radius=1.0))
+
+
 def test_a_narrowing_tube_narrows():
     path = straight()
     radius = np.linspace(2, 1, len(path))[:, None, None] * RADIUS

@@ -10,8 +10,11 @@ import pytest
 
 import liverjax as lj
 from liverjax.core.struct import replace
+from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.files import meshio_cells
+from liverjax.mesh.promotion import cubic
 from liverjax.mesh.refinement import refined
+from liverjax.mesh.selection import check_triangles
 from liverjax.scenes.regions import select_elements
 from liverjax.simulation.automatic import qualities
 from liverjax.tensors.matrices import deformation_gradient, pack
@@ -141,6 +144,8 @@ def test_meshes_refined_near_nodes_are_whole(shape):
 
 def test_triangles_inside_the_body_are_refined():
     """Only the new surface was searched for parts of these triangles, so the refined set was empty."""
+    none = replace(lj.shapes.box((1, 1, 1), (1, 1, 1)), triangle_sets={"none": np.zeros((0, 3), int)})
+    assert lj.refined(none).triangle_sets["none"].shape == (0, 3)
     mesh = lj.shapes.box((3, 3, 3), (3, 3, 3))
     tets, centre = np.asarray(mesh.tetrahedra), np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)].mean(axis=1)
     brick = lj.tet_mesh(mesh.points, tets[np.all((centre > 1) & (centre < 2), axis=1)])
@@ -152,6 +157,25 @@ def test_triangles_inside_the_body_are_refined():
         area = np.linalg.norm(np.cross(parts[:, 1] - parts[:, 0], parts[:, 2] - parts[:, 0]), axis=1).sum() / 2
         assert np.isclose(area, 6.0) and len(parts) == (count or len(parts))
     assert len(lj.quadratic(refined(mesh)).node_sets["tumour"]) == 98
+
+
+def test_triangles_of_a_refined_surface_point_outward():
+    mesh = lj.shapes.box((0.1, 0.1, 0.1), (2, 2, 2))
+    top = lj.boundary.boundary_triangles(mesh, mesh.node_sets["z_max"])
+    fine = refined(replace(mesh, triangle_sets={"top": jnp.asarray(top)}))
+    check_triangles(fine, fine.triangle_sets["top"], "top", outward=True)
+
+
+def test_volume_ratios_of_cubic_elements_do_not_depend_on_the_order_of_corners():
+    """The direction of functions on edges was not used at the vertices: J was -0.37 where it is 0.59."""
+    corners, found = np.vstack([np.zeros(3), np.eye(3)]), []
+    for order in ([0, 1, 2, 3], [3, 2, 1, 0]):
+        mesh = cubic(lj.quadratic(lj.tet_mesh(corners, [order])))
+        changed = 0.15 * np.random.default_rng(0).standard_normal((6, 3))
+        x = np.asarray(mesh.points).copy()
+        x[10:16] += changed  # the functions of order 3 on the edges
+        found.append(np.asarray(volume_ratios(mesh, jnp.asarray(x)))[-4:, 0][np.argsort(order)])
+    np.testing.assert_allclose(*found, rtol=1e-12)
 
 
 def _area(mesh: lj.TetMesh) -> float:

@@ -27,9 +27,9 @@ def volume_ratios(mesh: TetMesh, x: jax.Array) -> jax.Array:
     if mesh.order == 1:
         return J[None]
     c, D = functions(mesh.order, np.eye(4))[1], mesh.gradients
-    columns = [[x[:, i][n] for n in mesh.element_nodes] for i in range(3)]
+    values = mesh.oriented(jnp.stack([x[n].T for n in mesh.element_nodes]))  # (n, 3, E)
     corners = []
-    for column in columns:
+    for column in (values[:, i] for i in range(3)):
         y = [sum(c[a, k][:, None] * v[None] for a, v in enumerate(column) if c[a, k].any()) for k in range(4)]
         corners.append([y[k] - y[0] for k in (1, 2, 3)])
     F = tuple(tuple(sum(y[a] * D[a, j] for a in range(3)) for j in range(3)) for y in corners)

@@ -9,6 +9,7 @@ from liverjax.mesh.adjacency import PAIRS, node_numbers
 from liverjax.mesh.promotion import middles_of_set, quadratic
 from liverjax.mesh.selection import boundary_triangles, check_nodes, face_codes
 from liverjax.mesh.shape_functions import FACES
+from liverjax.mesh.tetrahedra import FACES as OUTWARD
 from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
 #: Even permutations of the corners of an element. Each leads to a different inner diagonal (`corner_orders`).
@@ -110,7 +111,7 @@ def _places_of_parts() -> np.ndarray:
 def _all_faces(mesh: TetMesh) -> np.ndarray:
     """Return the faces (m, 3) of all elements, each face once. Normals of faces on the surface point outward."""
     tets = np.asarray(mesh.tetrahedra)
-    faces = np.concatenate([tets[:, f] for f in FACES])
+    faces = np.concatenate([tets[:, f] for f in OUTWARD])
     codes = face_codes(np.sort(faces.astype(np.int64), axis=1), mesh.number_of_vertices)
     return faces[np.sort(np.unique(codes, return_index=True)[1])]
 
@@ -123,7 +124,7 @@ def _triangles_in(triangles: np.ndarray, faces: np.ndarray, ends: np.ndarray) ->
     """
     old = {tuple(corners) for corners in np.sort(triangles, axis=1).tolist()}
     near = faces[np.isin(ends[:, faces], triangles).all(axis=(0, 2))]
-    of_each = np.moveaxis(ends[:, near], 0, 1).reshape(len(near), -1).tolist()
+    of_each = np.moveaxis(ends[:, near], 0, 1).reshape(len(near), 6).tolist()
     return node_numbers(near[np.array([tuple(sorted(set(own))) in old for own in of_each], bool)])
 
 

@@ -101,7 +101,11 @@ def centre_lines(points: np.ndarray, triangles: np.ndarray, name: str = "vessel"
         number[own] = np.arange(len(own))
         here, corners = points[own], number[inside]
         away = _from_one_end(graph, own)[own]
-        found.append(_pieces(here, _rings_of(here, corners, away)))
+        lines = _pieces(here, _rings_of(here, corners, away))
+        if lines is None:
+            found = []
+            break
+        found.append(lines)
     if not found or not sum(len(lines.begin) for lines in found):
         raise InputError(f"{name} surface is too short or too coarse to find its centre line: give line and radius")
     return CentreLines(*(np.concatenate(arrays) for arrays in zip(*found, strict=True)))
@@ -166,14 +170,17 @@ def _rings_of(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> _R
     return _Rings(at, ring, band[low[first]], band[high[first]], band)
 
 
-def _pieces(points: np.ndarray, r: _Rings) -> CentreLines:
+def _pieces(points: np.ndarray, r: _Rings) -> CentreLines | None:
     """Join the centres of the two rings of every band by a straight piece of a centre line.
 
-    Where a branch ends, a piece from the centre of its last ring to the end of the surface is added.
+    Where a branch ends, a piece from the centre of its last ring to the end of the surface is added. Return None if
+    there is only one ring: it may be oblique, so its normal is not the direction of the tube.
     """
     count = np.bincount(r.ring)
     centre = np.stack([np.bincount(r.ring, r.points[:, k]) for k in range(3)], axis=1) / count[:, None]
     r, real = _without_tips(r, np.flatnonzero(count >= _LEAST))
+    if len(real) == 1:
+        return None
     lines = []
     for a in real:
         for b in real[r.below[real] == r.above[a]]:
@@ -189,6 +196,7 @@ def _pieces(points: np.ndarray, r: _Rings) -> CentreLines:
                 continue
             last = points[r.band == own] - centre[a]
             along = _outwards(centre, r, real, a, own)
+            along = along if np.sum(last @ along) >= 0 else -along  # the sign of a normal is arbitrary
             reach = (last @ along).max()
             if reach > 0:
                 lines.append((centre[a], centre[a] + reach * along, r.ring == a))
