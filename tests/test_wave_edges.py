@@ -212,6 +212,27 @@ def test_smoothed_labels_keep_place_and_volume():
     assert np.sum(farther.argmax(axis=0) == 2) > 1.2 * volume
 
 
+def test_edges_move_as_far_as_is_said():
+    """They moved 0.43 times as far, and the edge between two small regions did not move."""
+    X = np.stack(np.meshgrid(*[np.arange(n) for n in (25, 25, 7)], indexing="ij"), axis=-1)
+    r = np.hypot(X[..., 0] - 12.3, X[..., 1] - 11.8)
+    labels = 1 + (r < 9.5) + (r < 5)  # a core in a shell in a body
+    body, known = voxels.voxel_body(np.ones(labels.shape, bool), np.full(3, 2e-3)), np.array([1, 2, 3])
+    radii = []
+    for far in (0.0, 0.1, 0.4):
+        grids = np.zeros((3, *labels.shape))
+        grids[:, *body.voxel.T] = edge_places.places(labels, body, known, far)
+        fine = [ndimage.zoom(g[:, :, 3], 20, order=1).ravel() for g in grids]
+        own, step = np.argmax(fine, axis=0), 24 / (20 * 25 - 1)
+        radii.append([np.sqrt(np.sum(own >= k) / np.pi) * step for k in (1, 2)])
+    shell, core = (np.array(radii) - radii[0]).T
+    np.testing.assert_allclose(shell[1:], [0.1, 0.4], rtol=0.12)
+    np.testing.assert_allclose(core[1:], [0.1, 0.4], rtol=0.12)
+    near = np.flatnonzero(np.abs(r[tuple(body.voxel.T)] - 5) < 1)
+    patches, of_node = edge_places.patches_of(edge_places.places(labels, body, known), body, near)
+    assert np.all(patches.region[of_node[near]] == 2)  # the edge of the core, on both of its sides
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("radius", "centre", "spacing", "elements"),

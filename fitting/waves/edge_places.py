@@ -61,26 +61,42 @@ def places(labels: np.ndarray, body: VoxelBody, known: np.ndarray, farther: floa
         labels: label of each voxel (nx, ny, nz).
         body: only labels at the voxels of this body are used. Every other voxel gets the nearest of these labels.
         known: the R labels that occur in the body.
-        farther: distance [voxels] by which the edges of all regions except the largest are moved outwards.
+        farther: distance [voxels] by which edges are moved. The edge between two regions is moved out of the smaller
+            one.
     """
     measured = np.zeros(labels.shape, bool)
     measured[tuple(body.voxel.T)] = True
     nearest = ndimage.distance_transform_edt(~measured, return_distances=False, return_indices=True)
     whole = labels[tuple(nearest)]
     s = np.array([_smoothed(whole == label) for label in known])
-    counts = [int(np.sum(whole == label)) for label in known]
-    largest, out = int(np.argmax(counts)), s.copy()
+    counts, sizes = ([int(np.sum(own == label)) for label in known] for own in (whole, labels[measured]))
+    rank, out = np.argsort(np.argsort(sizes, kind="stable")), s.copy()  # the largest region has the highest rank
     for k in range(len(known)):
-        if k != largest:
+        if rank[k] < len(known) - 1:
             others = np.delete(s, k, axis=0).max(axis=0)
             # The constant is added only near this region. A small region needs a large constant, and elsewhere this
             # constant would move the edges of other regions.
             apart = ndimage.distance_transform_edt(whole != known[k])
             out[k] += _level(s[k] - others, whole == known[k], counts[k]) * np.clip(2 - 0.5 * apart, 0, 1)
-            if farther:
-                slope = np.gradient(out[k])
-                out[k] = out[k] + farther * np.sqrt(sum(g**2 for g in slope))
+    if farther:
+        out = _farther(out, rank, farther)
     return np.asarray(out[(slice(None), *body.voxel.T)])
+
+
+def _farther(s: np.ndarray, rank: np.ndarray, farther: float) -> np.ndarray:
+    """Return the indicator functions s (R, nx, ny, nz) with edges moved by `farther` [voxels] out of the smaller
+    regions. `rank` (R,): rank of each region by its size."""
+    out = s.copy()
+    for k in range(len(s)):
+        others = s.copy()
+        others[k] = -np.inf
+        above = s[k] - others.max(axis=0)
+        slope = np.stack(np.gradient(above))
+        normal = slope / np.maximum(np.linalg.norm(slope, axis=0), 1e-12)
+        # The value of `above` at a distance `farther` against the normal moves there, outwards.
+        moved = ndimage.map_coordinates(above, np.indices(above.shape) + farther * normal, order=3, mode="nearest")
+        out[k] += np.where(rank[others.argmax(axis=0)] > rank[k], moved - above, 0.0)
+    return out
 
 
 def _smoothed(place: np.ndarray) -> np.ndarray:
@@ -103,7 +119,7 @@ def patches_of(s: np.ndarray, body: VoxelBody, nodes: np.ndarray) -> tuple[Patch
     """Return the patches of the edges near given nodes, and the index of the nearest patch for each node (V,). The
     index is -1 for nodes that are not given.
 
-    The largest region has no patches, because its edges are also edges of the other regions.
+    The edge between two regions belongs to the smaller one. So the largest region has no patches.
 
     Args:
         s: smoothed indicator functions (R, V) from `places`.
@@ -113,8 +129,9 @@ def patches_of(s: np.ndarray, body: VoxelBody, nodes: np.ndarray) -> tuple[Patch
     of_node = np.full(body.mesh.number_of_nodes, -1)
     if len(s) < 2 or not len(nodes):
         return NO_PATCHES, of_node
-    smaller = np.flatnonzero(np.arange(len(s)) != np.bincount(s.argmax(axis=0), minlength=len(s)).argmax())
-    region = smaller[s[smaller].argmax(axis=0)[nodes]]
+    rank = np.argsort(np.argsort(np.bincount(s.argmax(axis=0), minlength=len(s)), kind="stable"))
+    highest = np.argsort(s[:, nodes], axis=0)[-2:]  # the two regions at the edge
+    region = np.where(rank[highest[0]] < rank[highest[1]], *highest)
     foot = np.empty((len(nodes), 3))
     for k in np.unique(region):
         own = region == k
