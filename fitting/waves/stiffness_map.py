@@ -11,8 +11,8 @@ same effect as the mean of c.
 
 The data depend only on the means of the field over the elements. A field with opposite signs at neighbouring corners
 has the mean 0 in every element, so the data do not determine such a field. Beside a jump of the modulus, the most
-probable field contains it. Therefore the map at a corner is not the value of the field there, but the mean of c over
-the elements around this corner.
+probable field contains it. Therefore the map shows the field after the filter 2 A - A A, where A is the mean of c over
+the elements around a corner. This filter removes the alternating field, and hardly changes a smooth field.
 
 The prior standard deviation of c is increased step by step. The increase ends when chi^2 is as low as the number of
 equations (discrepancy principle; Morozov 1966), or when the logarithm of the evidence, -(chi^2/n + |z|^2)/2 - ln det H,
@@ -96,8 +96,7 @@ class Course(NamedTuple):
     # 3 matrices (P, P). The product with c (the field of the exponent at the corners) gives the change of c along x, y
     # or z over w, the width over which the prior smooths a jump.
     slopes: tuple[scipy.sparse.csr_array, ...]
-    # Matrix (P, P): its product with c gives the means of c over the elements around each corner.
-    around: scipy.sparse.csr_array
+    shown: scipy.sparse.csr_array  # matrix (P, P) of the filter 2 A - A A (module docstring)
     p: smooth.Prior
     length: float  # correlation length of the prior [m]
     voxel: np.ndarray | None = None  # (V, 3) voxel index of each node; None: white noise is assumed
@@ -148,7 +147,7 @@ class Course(NamedTuple):
 
     def by_frequency(self, y: np.ndarray) -> np.ndarray:
         """Return c + l_f at the corners (F, P, …), from y (P + L, …)."""
-        c, levels = self.around @ y[: self.corners], y[self.corners :]
+        c, levels = self.shown @ y[: self.corners], y[self.corners :]
         return c[None] + (levels[:, None] if len(levels) else np.zeros((1, 1, *y.shape[1:])))
 
     def marks(self) -> dict[str, object]:
@@ -195,8 +194,9 @@ def course_of(body: VoxelBody, m: Matrices, waves: MeasuredWaves, whole: np.ndar
     levels = np.eye(number) if number > 1 else np.zeros((1, 0))
     every = np.ones((mean.shape[0], 1))
     exponents = tuple(scipy.sparse.hstack([mean, scipy.sparse.csr_array(every * own)], "csr") for own in levels)
-    slopes, around = _changes_over_slopes(body, mean, length), (_mean_around(body, mean) @ mean).tocsr()
-    return Course(m, waves, np.asarray(whole, complex), exponents, slopes, around, p, length, body.voxel)
+    slopes, once = _changes_over_slopes(body, mean, length), _mean_around(body, mean) @ mean
+    shown = (2 * once - once @ once).tocsr()
+    return Course(m, waves, np.asarray(whole, complex), exponents, slopes, shown, p, length, body.voxel)
 
 
 def map_of(
@@ -463,7 +463,7 @@ def _spread(
         """Yield c + l_f at the corners (P, n) for one frequency after another. All frequencies together would need too
         much memory."""
         levels = y[course.corners :]
-        c = course.around @ y[: course.corners]
+        c = course.shown @ y[: course.corners]
         return (c + level for level in (levels if len(levels) else [0.0]))
 
     def deviations(y: np.ndarray) -> np.ndarray:
