@@ -79,11 +79,11 @@ def places(labels: np.ndarray, body: VoxelBody, known: np.ndarray, farther: floa
             apart = ndimage.distance_transform_edt(whole != known[k])
             out[k] += _level(s[k] - others, whole == known[k], counts[k]) * np.clip(2 - 0.5 * apart, 0, 1)
     if farther:
-        out = _farther(out, rank, farther)
+        out = _moved_out(out, rank, farther)
     return np.asarray(out[(slice(None), *body.voxel.T)])
 
 
-def _farther(s: np.ndarray, rank: np.ndarray, farther: float) -> np.ndarray:
+def _moved_out(s: np.ndarray, rank: np.ndarray, farther: float) -> np.ndarray:
     """Return the indicator functions s (R, nx, ny, nz) with edges moved by `farther` [voxels] out of the smaller
     regions. `rank` (R,): rank of each region by its size."""
     out = s.copy()

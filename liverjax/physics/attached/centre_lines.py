@@ -91,7 +91,7 @@ def centre_lines(points: np.ndarray, triangles: np.ndarray, name: str = "vessel"
     lengths = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
     graph = scipy.sparse.coo_array((lengths, edges.T), shape=(len(points),) * 2).tocsr()
     parts, of = connected_components(graph, directed=False)
-    found = []
+    found, said = [], f"{name} surface is too short or too coarse to find its centre line: give line and radius"
     for part in range(parts):
         own = np.flatnonzero(of == part)
         inside = triangles[of[triangles[:, 0]] == part]
@@ -103,11 +103,10 @@ def centre_lines(points: np.ndarray, triangles: np.ndarray, name: str = "vessel"
         away = _from_one_end(graph, own)[own]
         lines = _pieces(here, _rings_of(here, corners, away))
         if lines is None:
-            found = []
-            break
+            raise InputError(said)
         found.append(lines)
     if not found or not sum(len(lines.begin) for lines in found):
-        raise InputError(f"{name} surface is too short or too coarse to find its centre line: give line and radius")
+        raise InputError(said)
     return CentreLines(*(np.concatenate(arrays) for arrays in zip(*found, strict=True)))
 
 
