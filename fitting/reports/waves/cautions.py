@@ -103,8 +103,8 @@ def _of_edges_in_map(drawn: WaveMap) -> list[str]:
     return [
         f"the modulus in the map changes by a factor of {np.exp(drawn.change.max()):.2g} within "
         f"{1e3 * drawn.length:.3g} mm (or within an element, if the elements are longer). Near such an edge, the "
-        "standard deviations of the map may be too small: in tests with a plane edge, the 90 % intervals contained the "
-        "true modulus in 71 to 98 % of the voxels. Compare the map with the moduli of regions"
+        "standard deviations of the map may be too small, also several voxels away from the edge. Compare the map with "
+        "the moduli of regions"
     ]
 
 
