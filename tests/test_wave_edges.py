@@ -228,6 +228,8 @@ def test_edges_move_as_far_as_is_said():
     shell, core = (np.array(radii) - radii[0]).T
     np.testing.assert_allclose(shell[1:], [0.1, 0.4], rtol=0.12)
     np.testing.assert_allclose(core[1:], [0.1, 0.4], rtol=0.12)
+    alone = edge_places.places(np.ones_like(labels), body, np.array([1]), 0.1)  # one label has no edge to move
+    np.testing.assert_allclose(alone, 1)
     near = np.flatnonzero(np.abs(r[tuple(body.voxel.T)] - 5) < 1)
     patches, of_node = edge_places.patches_of(edge_places.places(labels, body, known), body, near)
     assert np.all(patches.region[of_node[near]] == 2)  # the edge of the core, on both of its sides

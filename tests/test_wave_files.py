@@ -434,6 +434,8 @@ def test_rounded_positions_are_on_the_grid(tmp_path):
     assert np.allclose(spacing, 0.0015) and shape == (65, 6, 7)
     with pytest.raises(InputError, match="is not on a regular grid"):
         formats._grid(tmp_path, exact + rng.uniform(-2e-4, 2e-4, exact.shape), once)
+    with pytest.raises(InputError, match="is not on a regular grid"):  # and not a grid of 1 um with 10^9 voxels
+        formats._grid(tmp_path, np.round(exact + rng.uniform(-2e-4, 2e-4, exact.shape), 6), once)
     # Neighbouring rows of 1.3333 mm are rounded to 1.33 or 1.34 mm: not a grid of 0.01 mm.
     rounded = np.round(index * 0.0013333 + rng.uniform(-4e-6, 4e-6, exact.shape), 5)
     assert formats._grid(tmp_path, rounded, once)[3] == (5, 6, 7)

@@ -87,7 +87,7 @@ def _moved_out(s: np.ndarray, rank: np.ndarray, farther: float) -> np.ndarray:
     """Return the indicator functions s (R, nx, ny, nz) with edges moved by `farther` [voxels] out of the smaller
     regions. `rank` (R,): rank of each region by its size."""
     out = s.copy()
-    for k in range(len(s)):
+    for k in np.flatnonzero(rank < len(s) - 1):  # the largest region is not moved
         others = s.copy()
         others[k] = -np.inf
         above = s[k] - others.max(axis=0)

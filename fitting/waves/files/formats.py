@@ -7,6 +7,7 @@ of displacement, a file may have real and imag, phases (real values at instants 
 
 import difflib
 import itertools
+import math
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -290,8 +291,8 @@ def _quick_number(text: str, between: str) -> float | None:
 
 #: _JITTER: steps between positions that are shorter than this fraction of the longest step are regarded as errors of
 #: the positions, if this gives a regular grid. _UNEVEN: maximum distance of a position from the grid, divided by the
-#: spacing.
-_JITTER, _UNEVEN = 0.05, 0.05
+#: spacing. _SPARSE: maximum number of voxels of the grid, divided by the number of positions.
+_JITTER, _UNEVEN, _SPARSE = 0.05, 0.05, 1000
 
 
 def _grid(path: Path, X: np.ndarray, of: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]:
@@ -302,19 +303,21 @@ def _grid(path: Path, X: np.ndarray, of: np.ndarray) -> tuple[np.ndarray, np.nda
             f"{path}: the file has no rows, or some rows have no x, y, z; give the position of every voxel in metres"
         )
     origin = X.min(axis=0)
-    regular = None
+    regular, worst = None, ""
     # Errors of positions have to be left out, but not the short steps in a body with wide gaps: there, different voxels
     # would get the same index.
     for least in itertools.product((_JITTER, 0.0), repeat=3):
         spacing = np.array([_spacing_along(path, X[:, a] - origin[a], "xyz"[a], least[a]) for a in range(3)])
         at = np.rint((X - origin) / spacing).astype(int)
         off = np.abs(X - origin - at * spacing).max(axis=0) / spacing
-        if off.max() <= _UNEVEN:
-            regular = regular or (at, spacing, origin, tuple(int(n) for n in at.max(axis=0) + 1))
+        worst = worst or "xyz"[int(off.argmax())]
+        found = at, spacing, origin, tuple(int(n) for n in at.max(axis=0) + 1)
+        if off.max() <= _UNEVEN and math.prod(found[-1]) <= _SPARSE * len(X):
             if _all_differ(of, at):
-                return at, spacing, origin, tuple(int(n) for n in at.max(axis=0) + 1)
+                return found
+            regular = regular or found
     if regular is None:
-        raise InputError(f"{path}: {'xyz'[int(off.argmax())]} is not on a regular grid; give voxels with equal spacing")
+        raise InputError(f"{path}: {worst} is not on a regular grid; give voxels with equal spacing")
     return regular
 
 
