@@ -217,12 +217,12 @@ def test_strains_below_one_percent_may_be_fractions(tmp_path, tanned):
 
 
 def test_two_temperatures_and_deviations(tmp_path, tanned):
-    """Sweeps at 20 and 37 °C were read as one sweep."""
+    """Sweeps at 20 and 37 °C were read as one sweep, and then again if the first row had no temperature."""
     law, memories, shares = tanned
     path = written(tmp_path / "sweep.csv", law, memories, 0.0, shares)
     head, *rows = path.read_text().splitlines()
     for other, told in ((20.5, False), (37.0, True)):
-        both = [f"{r},20,1" for r in rows] + [f"{r},{other},1" for r in rows]
+        both = [f"{rows[0]},,1"] + [f"{r},20,1" for r in rows[1:]] + [f"{r},{other},1" for r in rows]
         path.write_text("\n".join([f"{head},temperature_C,storage_modulus_sd_Pa", *both]))
         if told:
             with pytest.raises(InputError, match="goes from 20 to 37 °C"):

@@ -132,6 +132,30 @@ def test_no_factors_are_told_of_a_power_law(noise):
         assert not master_curve._factors_of_moduli(parts, shifts.found(parts, T, 2))
 
 
+def test_factors_of_a_power_law_are_told_to_be_unknown():
+    """With --vertical, shifts of a power law were wrong by up to 9 standard errors, without a warning."""
+    true, T = np.array([0.0, -0.5, -0.9, -1.4, -1.8]), 273.15 + np.linspace(10.0, 50.0, 5)
+    omega, rng = np.geomspace(0.6, 60, 15), np.random.default_rng(0)
+    for part, told in (((1j * omega * 10 ** true[:, None]) ** 0.15, True), (None, False)):
+        G = np.stack([moduli_of_polymer(omega * 10**a) for a in true]) if part is None else 1e3 * part
+        spread = 1 + 0.02 * rng.standard_normal((2, 5, 15))
+        parts = [Sweep(omega, p, q) for p, q in zip(G.real * spread[0], G.imag * spread[1], strict=True)]
+        found = master_curve.master_curve(temperature_sweeps.AtTemperatures(parts, T, None), None, vertical=True)
+        assert any("remove --vertical, or measure a wider band" in n for n in found.sweep.notes) == told
+
+
+def test_the_shifts_of_a_power_law_are_a_minimum():
+    """Without a line search, the iteration ended in a cycle, farther from one curve than the true shifts."""
+    true, T = np.array([0.0, -0.5, -0.9, -1.4, -1.8]), 273.15 + np.linspace(10.0, 50.0, 5)
+    omega = np.geomspace(0.6, 60, 15)
+    spread = 1 + 0.02 * np.random.default_rng(1).standard_normal((2, 5, 15))
+    G = 1e3 * (1j * omega * 10.0 ** true[:, None]) ** 0.15
+    parts = [Sweep(omega, p, q) for p, q in zip(G.real * spread[0], G.imag * spread[1], strict=True)]
+    found = shifts.found(parts, T, 0, True, (0.6,))
+    at_true = shifts.distances_from_curve(parts, true, np.zeros(5), found.knots)
+    assert found.apart < np.sqrt(np.mean(at_true**2))
+
+
 def test_laws_have_their_numbers_and_errors():
     found = shifts.found(sweeps(0.01, 3), TEMPERATURES, REFERENCE)
     wlf, arrhenius = temperature_laws.temperature_laws_of(found)
@@ -292,6 +316,12 @@ def test_a_sweep_at_several_temperatures_that_fits_nothing_gets_the_remedy(tmp_p
             "do not match",
         ),
         ("frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,temperature_K\n1,2,1,-3\n2,3,1,20\n", [], "absolute zero"),
+        (
+            "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,temperature_C\n"
+            + "".join(f"{f},2,1,{T}\n" for T in (20, 30) for f in (1, 2, 3)).replace("2,2,1,20", "2,2,1,"),
+            [],
+            "the temperature of 1 of 6 rows is missing",
+        ),
         ("", ["--with", "a.csv"], "remove --with"),
     ],
 )

@@ -92,9 +92,12 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
 
 
 def _refuse_several_temperatures(path: Path, temperature: np.ndarray | None, kept: np.ndarray) -> None:
-    if temperature is None or np.ptp(temperature[kept]) <= LARGEST_DRIFT:
+    if temperature is None:
         return
-    low, high = temperature[kept].min() - 273.15, temperature[kept].max() - 273.15
+    known = temperature[kept & np.isfinite(temperature)]
+    if known.size == 0 or np.ptp(known) <= LARGEST_DRIFT:
+        return
+    low, high = known.min() - 273.15, known.max() - 273.15
     raise InputError(
         f"{path}: the temperature goes from {low:.3g} to {high:.3g} °C; give one file for each temperature"
     )

@@ -64,7 +64,7 @@ def master_curve(data: AtTemperatures, reference: float | None, vertical: bool =
         found = shifts.known_shifts(data.sweeps, T, place, log_a - log_a[place])
     else:
         found = shifts.found(data.sweeps, T, place, vertical)
-        untold = [] if vertical else _factors_of_moduli(data.sweeps, found)
+        untold = (_unshown_factors if vertical else _factors_of_moduli)(data.sweeps, found)
     parts = [_shifted_sweep(s, a, b) for s, a, b in zip(data.sweeps, found.log_a, found.log_b, strict=True)]
     laws = temperature_laws.temperature_laws_of(found)
     whole = joined(parts)
@@ -124,22 +124,10 @@ def _factors_of_moduli(sweeps: list[Sweep], found: Shifts) -> list[str]:
     (F-test)."""
     try:
         other = shifts.found(sweeps, found.temperatures, found.reference, vertical=True)
-        # For the F-test, both fits use the same distance between knots: the smaller of the two chosen distances.
-        knots = min(found.knots, other.knots)
-        alone, both = (
-            shifts.found(sweeps, found.temperatures, found.reference, vertical, (knots,)) for vertical in (False, True)
-        )
+        chance = _chance_of_factors(sweeps, found, other)
     except InputError:
         return []
-    more, data = len(sweeps) - 1, sum(2 * len(s.storage) for s in sweeps)
-    ratio = shifts.sum_of_squares(alone) / max(shifts.sum_of_squares(both), np.finfo(float).tiny)
-    freedom = data - 2 * more - 2 * shifts.size_of_curve(sweeps, both.log_a, knots)
-    if (
-        freedom < 1
-        or found.apart < SMOOTH
-        or not other.apart < BETTER * found.apart
-        or scipy.special.fdtrc(more, freedom, (ratio - 1) * freedom / more) > CHANCE
-    ):
+    if found.apart < SMOOTH or not other.apart < BETTER * found.apart or chance > CHANCE:
         return []
     b, T = 10.0**other.log_b, celsius(found.temperatures)
     moved = np.abs(other.log_a - found.log_a) / np.maximum(found.log_a_errors, 1e-12)
@@ -149,6 +137,50 @@ def _factors_of_moduli(sweeps: list[Sweep], found: Shifts) -> list[str]:
         f"the sweeps lie {100 * other.apart:.2g} % from one curve instead of {100 * found.apart:.2g} %, and log10 a at "
         f"{T[k]:.4g} °C is {other.log_a[k]:.3g} instead of {found.log_a[k]:.3g} ± {found.log_a_errors[k]:.1g}. The "
         "stated error does not contain this difference: give --vertical"
+    ]
+
+
+def _chance_of_factors(sweeps: list[Sweep], alone: Shifts, both: Shifts) -> float:
+    """Return the probability that factors of the moduli bring the sweeps so much nearer to one curve by chance
+    (F-test).
+
+    Args:
+        sweeps: the sweeps.
+        alone, both: shifts without and with factors of the moduli. For the F-test, both are fitted again with the same
+            distance between knots: the smaller of their two distances.
+
+    Raises:
+        InputError: with this distance between knots, the shifted sweeps do not overlap.
+    """
+    knots = min(alone.knots, both.knots)
+    at = both.temperatures, both.reference
+    alone, both = (shifts.found(sweeps, *at, vertical, (knots,)) for vertical in (False, True))
+    more, data = len(sweeps) - 1, sum(2 * len(s.storage) for s in sweeps)
+    ratio = shifts.sum_of_squares(alone) / max(shifts.sum_of_squares(both), np.finfo(float).tiny)
+    freedom = data - 2 * more - 2 * shifts.size_of_curve(sweeps, both.log_a, knots)
+    return 1.0 if freedom < 1 else float(scipy.special.fdtrc(more, freedom, max(0.0, ratio - 1) * freedom / more))
+
+
+def _unshown_factors(sweeps: list[Sweep], found: Shifts) -> list[str]:
+    """Return a warning if a power law fits the sweeps as well as the common curve (F-test). For a power law, any shift
+    of the frequency can be replaced by a factor of the moduli, so the linearised errors are too small."""
+    counts = [len(s.storage) for s in sweeps]
+    of_sweep = np.repeat(np.eye(len(sweeps)), counts, axis=0)
+    x = np.log10(np.concatenate([s.angular_frequency for s in sweeps]))[:, None]
+    G = [np.log10(np.concatenate([getattr(s, name) for s in sweeps])) for name in ("storage", "loss")]
+    # A power law has the same slope in log G' and log G'', and the temperature moves both by the same distance.
+    A = np.block([[of_sweep, x, np.zeros_like(x)], [of_sweep, x, np.ones_like(x)]])
+    y = np.concatenate(G)
+    straight = np.sum((A @ np.linalg.lstsq(A, y, rcond=None)[0] - y) ** 2) * np.log(10) ** 2
+    numbers = 2 * (len(sweeps) - 1) + 2 * shifts.size_of_curve(sweeps, found.log_a, found.knots)
+    more, freedom = numbers - A.shape[1], len(y) - numbers
+    ratio = straight / max(shifts.sum_of_squares(found), np.finfo(float).tiny)
+    if freedom < 1 or more < 1 or scipy.special.fdtrc(more, freedom, max(0.0, ratio - 1) * freedom / more) < CHANCE:
+        return []
+    return [
+        "a power law fits the sweeps as well as the common curve, and then shifts of the frequency and factors of the "
+        "moduli can replace each other. So --vertical does not determine these factors, and their stated errors are "
+        "too small: remove --vertical, or measure a wider band"
     ]
 
 

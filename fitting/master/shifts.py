@@ -24,15 +24,19 @@ from liverjax.core.errors import InputError
 #: KNOTS: distances between two knots [decades] that are tried. SMOOTH: weight of the penalty on third differences of
 #: the spline coefficients. The penalty is needed for knots without data.
 KNOTS, SMOOTH = (0.4, 0.6, 0.9, 1.35, 2.0, 3.0), 1e-3
-#: LONGEST: maximum step of a factor in one iteration [decades]. The iteration ends if all steps are below CONVERGED.
-LONGEST, CONVERGED = 0.3, 1e-6
+#: LONGEST: maximum step of a factor in one iteration [decades]. The iteration ends if all steps are below CONVERGED, or
+#: if a step reduces the sum of squares by less than the fraction FLAT.
+#: DAMPING: first and largest damping of a step (Levenberg 1944). A step that increases the sum of squares is repeated
+#: with ten times the damping.
+LONGEST, CONVERGED, FLAT, DAMPING = 0.3, 1e-6, 1e-6, (1e-6, 1e3)
 #: Settings for the first estimate of a shift. OVERLAP: minimum fraction of the shorter of two neighbouring
 #: sweeps that must overlap with the other one. REACH: shifts that are tried [decades].
 OVERLAP, REACH = 0.25, np.linspace(-8.0, 8.0, 801)
 #: CHANCE: G' and G'' get different weights if the probability that their distances from the curves differ so much by
 #: chance is below this value. The same limit holds for the noise of the sweeps in the standard errors. LEAST_DEGREES:
 #: degrees of freedom needed to estimate the noise of a sweep. ROUNDS: maximum number of fits, each followed by new
-#: weights. SETTLED: the fits end if no weight changes by more than this fraction. MOST: largest ratio of the weights.
+#: weights. SETTLED: the fits end if no weight changes by more than this fraction and no log a by more than this number.
+#: MOST: largest ratio of the weights.
 CHANCE, LEAST_DEGREES, ROUNDS, SETTLED, MOST = 1e-3, 3.0, 8, 0.02, 100.0
 #: Two sweeps match within the noise if their mean square distance, divided by the variance of their noise, is at most
 #: this value.
@@ -100,6 +104,11 @@ def _in_decades(sweeps: Sequence[Sweep]) -> list[tuple[np.ndarray, np.ndarray, n
     return [(np.log10(s.angular_frequency), np.log10(s.storage), np.log10(s.loss)) for s in sweeps]
 
 
+def _shifted_places(columns: list, log_a: np.ndarray) -> np.ndarray:
+    """Return log10 of the shifted angular frequencies of all points (n,)."""
+    return np.concatenate([c[0] + a for c, a in zip(columns, log_a, strict=True)])
+
+
 def _points_of(sweeps: Sequence[Sweep]) -> np.ndarray:
     return np.array([len(s.storage) for s in sweeps])
 
@@ -154,10 +163,11 @@ def _at_knots(
     points = int(counts.sum())
     log_a, log_b, weights = *first, np.ones(2)
     for _ in range(ROUNDS):
-        log_a, log_b, A, b = _by_gauss_newton(columns, (log_a, log_b), free, knots, weights)
+        before = log_a
+        log_a, log_b, A, b = _by_least_squares(columns, (log_a, log_b), free, knots, weights)
         own = _weights_of_moduli(b[: 2 * points].reshape(2, points) / weights[:, None], points - A.shape[1] / 2)
         settled, weights = np.abs(np.log(own / weights)).max() < SETTLED, own
-        if settled:
+        if settled and np.abs(log_a - before).max() < SETTLED:
             break
     covariance = np.zeros((2 * len(sweeps),) * 2)
     found = _covariance(A, b, counts)[: free.sum(), : free.sum()]
@@ -169,23 +179,44 @@ def _at_knots(
     return Shifts(*at, log_a, spread[0], log_b, spread[1], misfit, counts, of_a, knots, weights=found_weights)
 
 
-def _by_gauss_newton(
+def _by_least_squares(
     columns: list, first: tuple[np.ndarray, np.ndarray], free: np.ndarray, knots: float, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return log a (K,), log b (K,), and the matrix and the right-hand side of the last step. The matrix has columns
-    only for the fitted factors and for the curves. `weights` (2,) multiply the distances in log G' and in log G''. The
-    other arguments are the same as for `_at_knots`."""
-    log_a, log_b = first
+    """Return log a (K,), log b (K,), and the matrix and the right-hand side of the last linear problem (method of
+    Levenberg and Marquardt). The matrix has columns only for the fitted factors and for the curves. `weights` (2,)
+    multiply the distances in log G' and in log G''. The other arguments are the same as for `_at_knots`."""
+    factors, damping = np.stack(first), DAMPING[0]
+    # The knots stay where they are during the iteration. Otherwise the sum of squares would change with them.
+    grid = _knot_grid(_shifted_places(columns, first[0]), knots)
+    A, b = _linear_problem(columns, factors[0], factors[1], grid, weights)
     for _ in range(60):
-        A, b = _linear_problem(columns, log_a, log_b, knots, weights)
-        step = np.zeros((2, len(columns)))
-        kept = np.concatenate([free.ravel(), np.ones(A.shape[1] - free.size, bool)])
-        step[free] = np.linalg.lstsq(A[:, kept], b, rcond=None)[0][: free.sum()]
-        moved = np.clip(step, -LONGEST, LONGEST)
-        log_a, log_b = log_a + moved[0], log_b + moved[1]
-        if np.abs(moved).max() < CONVERGED:
+        step = _damped_step(A, b, free, damping)
+        if np.abs(step).max() < CONVERGED:
             break
-    return log_a, log_b, A[:, kept], b
+        further = _linear_problem(columns, factors[0] + step[0], factors[1] + step[1], grid, weights)
+        before, after = b @ b, further[1] @ further[1]
+        if after < before:
+            factors, (A, b), damping = factors + step, further, max(damping / 10, DAMPING[0])
+            if after > (1 - FLAT) * before:
+                break
+        elif damping < DAMPING[1]:
+            damping *= 10
+        else:
+            break
+    return factors[0], factors[1], _free_columns(A, free), b
+
+
+def _free_columns(A: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Return the columns of the matrix A that belong to fitted factors or to the curves. `free`: see `_at_knots`."""
+    return A[:, np.concatenate([free.ravel(), np.ones(A.shape[1] - free.size, bool)])]
+
+
+def _damped_step(A: np.ndarray, b: np.ndarray, free: np.ndarray, damping: float) -> np.ndarray:
+    """Return the step (2, K) of the factors for the linear problem A, b. It is at most `LONGEST`."""
+    own, step = _free_columns(A, free), np.zeros(free.shape)
+    damp = np.sqrt(damping) * np.eye(int(free.sum()), own.shape[1])
+    step[free] = np.linalg.lstsq(np.vstack([own, damp]), np.append(b, np.zeros(len(damp))), rcond=None)[0][: len(damp)]
+    return step * min(1.0, LONGEST / max(np.abs(step).max(), LONGEST))
 
 
 def _weights_of_moduli(distances: np.ndarray, degrees: float) -> np.ndarray:
@@ -247,8 +278,8 @@ def distances_from_curve(sweeps: Sequence[Sweep], log_a: np.ndarray, log_b: np.n
 def _distances_of_moduli(sweeps: Sequence[Sweep], log_a: np.ndarray, log_b: np.ndarray, knots: float) -> np.ndarray:
     """Return the distances (2, n) [decades] of all n points of the shifted sweeps from the curves of G' and of G''."""
     columns = _in_decades(sweeps)
-    x = np.concatenate([c[0] + a for c, a in zip(columns, log_a, strict=True)])
-    B = _basis(x, knots)[0]
+    x = _shifted_places(columns, log_a)
+    B = _basis(x, _knot_grid(x, knots))[0]
     every = [np.concatenate([c[j] + b for c, b in zip(columns, log_b, strict=True)]) for j in (1, 2)]
     return np.stack([B @ _smooth_coefficients(B, y) - y for y in every])
 
@@ -257,25 +288,30 @@ def size_of_curve(sweeps: Sequence[Sweep], log_a: np.ndarray, knots: float) -> i
     """Return the number of spline coefficients of the curve of G' for shifted sweeps. The curve of G'' has the same
     number of coefficients."""
     x = np.concatenate([np.log10(s.angular_frequency) + a for s, a in zip(sweeps, log_a, strict=True)])
-    return _basis(x, knots)[0].shape[1]
+    return _basis(x, _knot_grid(x, knots))[0].shape[1]
 
 
-def _basis(x: np.ndarray, apart: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values (n, C) and derivatives (n, C) of C cubic B-splines at n points x (n,). The distance between
-    neighbouring knots is at most `apart`."""
+def _knot_grid(x: np.ndarray, apart: float) -> tuple[float, float]:
+    """Return the place of one knot, and the distance between two knots (at most `apart`) [decades], such that the first
+    and the last of the points x (n,) lie on knots."""
     low, high = x.min() - 1e-6, x.max() + 1e-6
-    count = max(2, int(np.ceil((high - low) / apart)) + 1)
-    inner = np.linspace(low, high, count)
-    step = inner[1] - inner[0]
-    knots = np.concatenate([low - step * np.arange(3, 0, -1), inner, high + step * np.arange(1, 4)])
-    size = len(knots) - 4
-    spline = BSpline(knots, np.eye(size), 3)
+    return low, (high - low) / max(1, int(np.ceil((high - low) / apart)))
+
+
+def _basis(x: np.ndarray, grid: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the values (n, C) and derivatives (n, C) of C cubic B-splines at n points x (n,). `grid`: see
+    `_knot_grid`."""
+    place, apart = grid
+    first, last = int(np.floor((x.min() - place) / apart)), int(np.floor((x.max() - place) / apart)) + 1
+    knots = place + apart * np.arange(first - 3, last + 4)
+    spline = BSpline(knots, np.eye(len(knots) - 4), 3)
     return spline(x), spline.derivative()(x)
 
 
-def _smooth_coefficients(B: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _smooth_coefficients(B: np.ndarray, y: np.ndarray, weight: float = 1.0) -> np.ndarray:
     rows = _smoothness(B.shape[1])
-    return np.linalg.lstsq(np.vstack([B, rows]), np.concatenate([y, np.zeros(len(rows))]), rcond=None)[0]
+    A, b = np.vstack([weight * B, rows]), np.concatenate([weight * y, np.zeros(len(rows))])
+    return np.linalg.lstsq(A, b, rcond=None)[0]
 
 
 def _smoothness(size: int) -> np.ndarray:
@@ -283,26 +319,26 @@ def _smoothness(size: int) -> np.ndarray:
 
 
 def _linear_problem(
-    columns: list, log_a: np.ndarray, log_b: np.ndarray, knots: float, weights: np.ndarray
+    columns: list, log_a: np.ndarray, log_b: np.ndarray, grid: tuple[float, float], weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the matrix and the right-hand side of a Gauss-Newton step. The unknowns are log a and log b of the K
     sweeps, and the coefficients of the curves of G' and G''. `weights` (2,) multiply the rows of G' and of G''."""
     K, counts = len(columns), [len(c[0]) for c in columns]
-    x = np.concatenate([c[0] + a for c, a in zip(columns, log_a, strict=True)])
+    x = _shifted_places(columns, log_a)
     own = np.repeat(np.eye(K), counts, axis=0)
-    B, slope = _basis(x, knots)
-    size, rows, right = B.shape[1], [], []
+    B, slope = _basis(x, grid)
+    size, rows, right, penalty = B.shape[1], [], [], []
     for j in (1, 2):
         y = np.concatenate([c[j] + b for c, b in zip(columns, log_b, strict=True)])
-        c = _smooth_coefficients(B, y)
+        c = _smooth_coefficients(B, y, weights[j - 1])
         part = [np.zeros((len(x), size)), np.zeros((len(x), size))]
         part[j - 1] = B
         rows.append(weights[j - 1] * np.hstack([(slope @ c)[:, None] * own, -own, *part]))
         right.append(weights[j - 1] * (y - B @ c))
+        penalty.append(-_smoothness(size) @ c)
     smooth = np.kron(np.eye(2), _smoothness(size))
     A = np.vstack([*rows, np.hstack([np.zeros((len(smooth), 2 * K)), smooth])])
-    # The rows of the penalty have the right-hand side 0, so they keep the change of the coefficients smooth.
-    return A, np.concatenate([*right, np.zeros(len(smooth))])
+    return A, np.concatenate([*right, *penalty])
 
 
 def _covariance(A: np.ndarray, b: np.ndarray, counts: np.ndarray) -> np.ndarray:

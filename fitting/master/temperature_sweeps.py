@@ -106,11 +106,16 @@ def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, flo
     """Return (temperature [K], shift factor, points of the sweep) for each temperature in a table. The shift factor is
     NaN if it is unknown."""
     raw = sweep.raw or {}
-    if "temperature" in raw:
-        T = raw["temperature"]
-    else:
+    T = raw.get("temperature", np.full(len(sweep.storage), np.nan))
+    missing = ~np.isfinite(T)
+    if np.any(missing):
         # A hyphen after a letter or a digit separates words ("Sweep-25C"), so it is not a minus sign.
         stated = re.search(r"((?:(?<![^\W_])-)?\d+(?:[.,]\d+)?)\s*°?\s*([CK])\b", name)
+        if stated is None and not np.all(missing):
+            raise InputError(
+                f"{path}: the temperature of {missing.sum()} of {len(T)} rows is missing; fill in these cells, or "
+                "remove these rows"
+            )
         if stated is None:
             raise InputError(
                 f"{path}: the table {repr(name) if name else 'of the file'} states no temperature; add a column "

@@ -152,7 +152,8 @@ def warnings(found: Samples) -> list[str]:
                 )
     out += _limits_of_typical(found)
     out += outliers(found)
-    heat = np.array([np.mean(s.raw["temperature"]) for s in found.sweeps if s.raw and "temperature" in s.raw])
+    columns = [s.raw["temperature"] for s in found.sweeps if s.raw and "temperature" in s.raw]
+    heat = np.array([np.nanmean(column) for column in columns if np.any(np.isfinite(column))])
     if heat.size and np.ptp(heat) > WARMER:
         low, high = celsius(np.array([heat.min(), heat.max()]))
         out.append(

@@ -209,15 +209,13 @@ def _perhaps_thousands(rows: list[list[str]], columns: list[Column], sign: str |
 def _raw(cells, unit_rows, rows, delimiter, sign) -> dict[str, np.ndarray]:
     """Return raw torque, angle, phase, strain and temperature in SI units, for the rows of a table.
 
-    An empty cell is NaN. A temperature column with an empty cell is ignored. `sign` is the table's decimal sign.
+    An empty cell is NaN. `sign` is the table's decimal sign.
     """
     found, units = {}, unit_rows[-1] if unit_rows else []
     measured = {q: (place, factor, 0.0) for q, (place, factor) in raw_torque.known_columns(cells, units).items()}
     for quantity, (place, factor, offset) in (measured | condition_columns(cells, units)).items():
         values = _cells_of(place, rows, delimiter, sign)
-        known = np.isfinite(values)
-        # A temperature is needed in every row. For the other columns, later steps ignore points without a value.
-        if known.all() if quantity == "temperature" else known.any():
+        if np.any(np.isfinite(values)):
             found[quantity] = factor * values + offset
     return found
 
