@@ -65,6 +65,25 @@ def test_a_tube_with_one_ring_left_is_refused(length, rings, closed):
         centre_lines(*tube(path, 12 if rings == 4 else 24, closed, radius=1.0))
 
 
+@pytest.mark.parametrize(("length", "rings"), [(2, 9), (3, 13)])
+def test_a_tube_shorter_than_its_rings_is_refused(length, rings):
+    """All lines of equal distance end at the open ends. They counted as rings, and eight pieces left the tube."""
+    path = np.linspace(0, length, rings)[:, None] * np.array([[1.0, 0.0, 0.0]])
+    with pytest.raises(lj.InputError, match="too short or too coarse"):
+        centre_lines(*tube(path, 24, False, radius=1.0))
+
+
+@pytest.mark.parametrize("hole", [False, True])
+def test_an_oblique_end_and_a_hole_change_no_radius(hole):
+    """Lines that end at the border of an oblique end have centres near the wall. The last radius was 22 % too small."""
+    points, triangles = tube(np.linspace(0, 20, 81)[:, None] * np.array([[1.0, 0.0, 0.0]]), 24, False, radius=1.0)
+    points[:, 0] += 2 * points[:, 1] * points[:, 0] / 20
+    if hole:
+        triangles = np.delete(triangles, np.flatnonzero(triangles[:, 0] == 40 * 24 + 5), axis=0)
+    found = centre_lines(points, triangles)
+    np.testing.assert_allclose(found.radius, 1.0, rtol=0.05)
+
+
 def test_a_narrowing_tube_narrows():
     path = straight()
     radius = np.linspace(2, 1, len(path))[:, None, None] * RADIUS

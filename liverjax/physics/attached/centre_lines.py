@@ -23,6 +23,9 @@ _BAND = 2.0
 #: Minimum number of points of a ring. A ring with fewer points is ignored, since it probably does not go around a
 #: tube.
 _LEAST = 5
+#: A ring may be interrupted, for example by a hole of the surface, if the gap is shorter than this fraction of the
+#: ring's length. Longer gaps belong to lines that end at the open end of a tube, so these lines are no rings.
+_GAP = 0.25
 
 
 class CentreLines(NamedTuple):
@@ -68,6 +71,7 @@ class _Rings(NamedTuple):
 
     points: np.ndarray  # (p, 3) [m] where edges of the surface cross a level of the distance from one end of the tube
     ring: np.ndarray  # (p,) number of the ring of each point
+    closed: np.ndarray  # (r,) False for a line that does not go around the tube (`_GAP`)
     below: np.ndarray  # (r,) number of the band on the side of each ring with smaller distances
     above: np.ndarray  # (r,) number of the band on the other side of each ring
     band: np.ndarray  # (n,) number of the band of each corner
@@ -166,7 +170,25 @@ def _rings_of(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> _R
     count, ring = connected_components(touching, directed=False)
     first = np.zeros(count, int)
     first[ring] = np.arange(len(ring))
-    return _Rings(at, ring, band[low[first]], band[high[first]], band)
+    return _Rings(at, ring, _goes_around(at, ring, pairs), band[low[first]], band[high[first]], band)
+
+
+def _goes_around(points: np.ndarray, ring: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Return for each of r rings whether it goes around the tube (r,).
+
+    Args:
+        points: positions (p, 3) [m] of the points of all rings.
+        ring: (p,) number of the ring of each point.
+        pairs: (s, 2) numbers of neighbouring points.
+    """
+    count = ring.max() + 1
+    lengths = np.bincount(ring[pairs[:, 0]], np.linalg.norm(np.diff(points[pairs], axis=1)[:, 0], axis=1), count)
+    ends = np.flatnonzero(np.bincount(pairs.ravel(), minlength=len(ring)) < 2)
+    gaps = np.zeros(count)
+    for a in np.unique(ring[ends]):
+        own = points[ends[ring[ends] == a]]
+        gaps[a] = np.linalg.norm(own[:, None] - own, axis=2).max()
+    return gaps < _GAP * (lengths + gaps)
 
 
 def _pieces(points: np.ndarray, r: _Rings) -> CentreLines | None:
@@ -177,7 +199,8 @@ def _pieces(points: np.ndarray, r: _Rings) -> CentreLines | None:
     """
     count = np.bincount(r.ring)
     centre = np.stack([np.bincount(r.ring, r.points[:, k]) for k in range(3)], axis=1) / count[:, None]
-    r, real = _without_tips(r, np.flatnonzero(count >= _LEAST))
+    r, real, open_ends = _without_open_lines(r, np.flatnonzero(count >= _LEAST))
+    r, real = _without_tips(r, real, open_ends)
     if len(real) == 1:
         return None
     lines = []
@@ -204,16 +227,31 @@ def _pieces(points: np.ndarray, r: _Rings) -> CentreLines | None:
     return CentreLines(begin, end, np.array(radius))
 
 
-def _without_tips(r: _Rings, real: np.ndarray) -> tuple[_Rings, np.ndarray]:
+def _without_open_lines(r: _Rings, real: np.ndarray) -> tuple[_Rings, np.ndarray, np.ndarray]:
+    """Remove the lines that do not go around the tube. The bands on both sides of a removed line become one band.
+    Return also the numbers of these bands."""
+    import scipy.sparse
+    from scipy.sparse.csgraph import connected_components
+
+    lines, bands = real[~r.closed[real]], int(r.band.max()) + 1
+    sides = (r.below[lines], r.above[lines])
+    graph = scipy.sparse.coo_array((np.ones(len(lines)), sides), shape=(bands, bands))
+    of = connected_components(graph, directed=False)[1]
+    merged = r._replace(band=of[r.band], below=of[r.below], above=of[r.above])
+    return merged, real[r.closed[real]], np.unique(merged.below[lines])
+
+
+def _without_tips(r: _Rings, real: np.ndarray, open_ends: np.ndarray) -> tuple[_Rings, np.ndarray]:
     """Remove the last ring of each branch, since this ring may lie around a corner of the flat end of the tube.
 
-    The bands on both sides of a removed ring become one band.
+    The bands on both sides of a removed ring become one band. Next to a band of `open_ends` no ring is removed: there
+    the end of the tube is open, and lines around its corners do not go around the tube.
     """
     keep, band, below, above = set(real.tolist()), r.band.copy(), r.below.copy(), r.above.copy()
     sides = np.concatenate([below[real], above[real]])
     for a in real:
         for tip, inner in ((below[a], above[a]), (above[a], below[a])):
-            if np.sum(sides == tip) == 1 and np.sum(sides == inner) == 2:
+            if tip not in open_ends and np.sum(sides == tip) == 1 and np.sum(sides == inner) == 2:
                 keep.discard(int(a))
                 band[band == tip] = inner
     return r._replace(band=band), np.array(sorted(keep), int)
