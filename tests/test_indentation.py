@@ -8,7 +8,7 @@ import pytest
 from fitting.__main__ import main
 from fitting.methods.contact_point import fit_contact, fit_with_offset
 from fitting.readers.indentation_curves import _end_of_loading, read_indentation
-from fitting.rigs.thin_layer import Indenter, Layer
+from fitting.rigs.thin_layer import Indenter, Layer, half_space
 from liverjax.core.errors import InputError
 
 R, H, E, START = 5e-3, 10e-3, 2400.0, 2e-4
@@ -288,6 +288,47 @@ def test_a_negative_offset_that_is_fitted_is_no_adhesion(tmp_path, capsys):
     assert main(command) == 0
     assert json.loads((tmp_path / "fit.json").read_text())["force_offset_N"] < -0.2 * force.max()
     assert "adhesion" not in capsys.readouterr().err
+
+
+def written(tmp_path, depth: np.ndarray, force: np.ndarray) -> dict:
+    """Fit a curve of a sphere of 2 mm on a layer of 5 mm with the command, and return the content of fit.json."""
+    rows = np.column_stack([depth, force])
+    np.savetxt(tmp_path / "c.csv", rows, "%.9g", ",", header="depth_m,force_N", comments="")
+    command = ["indentation", str(tmp_path / "c.csv"), "--radius", "0.002", "--thickness", "0.005"]
+    assert main([*command, "--out", str(tmp_path)]) == 0
+    return json.loads((tmp_path / "fit.json").read_text())
+
+
+def test_a_contact_point_far_before_the_first_depth_is_found_and_told(tmp_path):
+    """The search ended half a range of depths before the first depth, without a message: E was 3.9 times too large."""
+    layer, depth = Layer(Indenter("sphere", 5e-3, 0.5, 2e-3)), np.linspace(0, 3e-4, 60)
+    noise = 0.003 * np.random.default_rng(0).standard_normal(60)
+    force = 1000 * layer.force(depth + 6e-4)
+    content = written(tmp_path, depth, force + force.max() * noise)
+    assert content["contact_point"] == pytest.approx(-6e-4, rel=0.03)
+    assert content["young_modulus"] == pytest.approx(1000, rel=0.03)
+    assert any("m before the first depth, outside the measured curve" in w for w in content["warnings"])
+
+
+def test_the_modulus_of_a_half_space_is_that_of_a_fit(tmp_path):
+    """The contact point of the layer was used, so the modulus was that of no fit: 1404 Pa."""
+    rig, depth = Indenter("sphere", 5e-3, 0.5, 2e-3), np.linspace(-3e-4, 1e-3, 130)
+    force = 1000 * Layer(rig).force(depth)
+    content = written(tmp_path, depth, force)
+    alone = fit_with_offset(depth, force, lambda d: half_space(rig, d))
+    assert content["half_space_young_modulus"] == pytest.approx(alone.modulus, rel=1e-4) and alone.modulus > 1500
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_reading_of_one_step_below_zero_is_no_adhesion(tmp_path, seed):
+    """The estimate of the noise is 0 if most forces are rounded to the same value."""
+    depth = np.linspace(-7e-4, 3e-4, 400)
+    force = 1000 * Layer(Indenter("sphere", 5e-3, 0.5, 2e-3)).force(depth)
+    step = force.max() / 1000
+    noise = 0.3 * np.random.default_rng(seed).standard_normal(400)
+    content = written(tmp_path, depth, step * np.round(force / step + noise))
+    assert not any("adhesion" in w for w in content["warnings"])
+    assert any("adhesion" in w for w in written(tmp_path, depth, force - 20 * step * (depth > 0))["warnings"])
 
 
 def test_without_an_approach_the_zero_is_taken_as_it_is():

@@ -119,6 +119,16 @@ def test_the_draws_of_one_mode_have_the_moments_of_quadrature():
     assert found.r_hat.max() < 1.01
 
 
+def test_noise_of_different_size_in_the_two_moduli_is_weighted():
+    """The posterior took one size of noise for both. Its equilibrium modulus had a standard deviation of 2.7 Pa."""
+    s, rng = one_mode(0.0, 1), np.random.default_rng(1)
+    s = s._replace(storage=s.storage * (1 + 0.003 * rng.normal(size=11)), loss=s.loss * (1 + 0.1 * rng.normal(size=11)))
+    fit = viscoelastic.closed_form(s, 1)
+    assert fit.noise_root is not None
+    draws = posterior.of_sweep(fit, s, 200).draws.reshape(-1, 4)[:, 1]
+    assert draws.std() < 1.2 and abs(draws.mean() - 420) < 3 * draws.std()
+
+
 def test_the_error_of_the_inertia_is_drawn_with_its_prior():
     """Moments of five numbers are compared with quadrature of the density, which is written out here."""
     s = one_mode(0.1, 1)
@@ -258,7 +268,9 @@ def test_a_springpot_has_the_errors_of_its_curvature():
 
     found = levenberg_marquardt(residuals, start)
     p = uncertainty.estimated(model.names, values, found, 22, False)
-    fit = types.SimpleNamespace(kind=viscoelastic.Kind(model.name, values=values), solution=found, details={})
+    fit = types.SimpleNamespace(
+        kind=viscoelastic.Kind(model.name, values=values), solution=found, details={}, noise_root=None
+    )
     draws = posterior.of_sweep(fit, sweep, 500)
     flat = draws.draws.reshape(-1, 2)
     assert draws.names == p.names and "exponents are uniform" in draws.prior

@@ -69,6 +69,30 @@ def test_a_stiffer_sample_is_a_factor_and_waves_are_predicted_too():
     assert np.allclose(waves.predicted, np.concatenate([c, a]), rtol=1e-6) and waves.inside.all()
     outside = prediction.predict(fit, s.resolved, Dispersion(OMEGA + 1e4, c, None, 1000.0))
     assert "outside the band" in prediction.sentence(outside)
+    # The scatter of three values is unknown. It was taken as 0, so none of them was inside the interval.
+    few = prediction.predict(fit, s.resolved, Dispersion(OMEGA[:3], 1.03 * c[:3], None, 1000.0))
+    assert np.isnan(few.covered) and "on average" in (told := prediction.sentence(few)) and "interval" not in told
+    moduli = (1.03 * G[:3] for G in generalised_maxwell.moduli(TRUTH, OMEGA))
+    given = Sweep(OMEGA[:3], *moduli, *(0.03 * G[:3] for G in generalised_maxwell.moduli(TRUTH, OMEGA)))
+    assert prediction.predict(fit, s.resolved, given).covered == 1.0
+
+
+def test_the_error_of_a_noisy_test_is_its_noise():
+    """With 10 % of noise, the error was given as about 2 %, because the divisor grew with the noise."""
+    test = relaxation()
+    noise = 0.1 * np.random.default_rng(1).standard_normal(len(test.time))
+    s = sweep(0.0, 0)
+    found = prediction.predict(
+        viscoelastic.closed_form(s, 2), s.resolved, test._replace(answer=test.answer + 400 * noise)
+    )
+    off = np.abs(found.predicted / found.measured - 1)[found.inside].mean()
+    assert found.relative_errors[found.inside].mean() == pytest.approx(off, rel=0.2) and off > 0.05
+    for factor in (0.5, 2.0, 3.0):  # the error of a wrong prediction is relative to the data
+        other = s._replace(storage=factor * s.storage, loss=factor * s.loss)
+        wrong = prediction.predict(viscoelastic.closed_form(other, 2), s.resolved, relaxation())
+        assert wrong.relative_errors[wrong.inside].mean() == pytest.approx(abs(factor - 1), rel=1e-3)
+    tail = found._replace(sizes=np.full(len(found.sizes), np.inf))
+    assert "in the band have decayed into the noise" in prediction.sentence(tail)
 
 
 @pytest.mark.slow

@@ -139,12 +139,30 @@ def test_the_command_reads_waves_and_writes_waves(tmp_path):
         ("frequency_Hz,phase_velocity_m/s\n50,1.5\n60,1.6\n", "2 rows"),
         ("frequency_Hz,phase_velocity_furlong\n50,1.5\n60,1.6\n70,1.7\n", "unit 'furlong' of velocity"),
         ("frequency_Hz,storage_modulus_Pa\n50,1.5\n", "no header names"),
+        (
+            "frequency_Hz,speed [m/s],velocity [m/s]\n50,1,2\n",
+            "columns 2, 3 may all contain velocity; keep one of these",
+        ),
     ],
 )
 def test_bad_files_are_refused(tmp_path, text, words):
     (tmp_path / "w.csv").write_text(text)
     with pytest.raises(InputError, match=words):
         dispersion.read_dispersion(tmp_path / "w.csv")
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        "frequency [Hz],velocity SD [m/s],velocity mean [m/s]",
+        "frequency_Hz,phase_velocity_error_m/s,phase_velocity_m/s",
+        '"frequency (Hz)","shear wave speed standard deviation (m/s)","shear wave speed (m/s)"',
+    ],
+)
+def test_a_column_of_errors_is_not_the_velocity(tmp_path, head):
+    """The first column whose heading begins with the velocity was read, so the velocity was its own deviation."""
+    (tmp_path / "w.csv").write_text(f"{head}\n50,0.1,1.5\n60,0.1,1.6\n70,0.1,1.7\n")
+    np.testing.assert_allclose(dispersion.read_dispersion(tmp_path / "w.csv").velocity, [1.5, 1.6, 1.7])
 
 
 @pytest.mark.parametrize(

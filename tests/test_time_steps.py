@@ -11,6 +11,7 @@ from fitting.readers.displacements import Displacements
 from fitting.rigs import glued
 from fitting.rigs.time_steps import change_with_small_steps, order_of_steps
 from liverjax.core.struct import replace
+from liverjax.physics.rigid_plate import RigidPlate
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -63,6 +64,16 @@ def test_the_estimate_is_the_change_with_many_small_steps(dt, options, order):
 def test_a_constant_load_has_an_error_of_first_order():
     assert order_of_steps(block(0.1, 6, rise=None)) == 1
     unloaded = replace(block(0.1, 6, rise=None), traction=())
+    # Loads and motions whose history begins at once had order 2.
+    nodes, times = unloaded.mesh.node_sets["z_max"], jnp.array([0.0, 9.0])
+    for begin, order in ((1.0, 1), (0.0, 2)):
+        loaded = block(0.1, 6)
+        own = replace(loaded.traction[0], times=times, history=jnp.array([begin, 1.0]))
+        moved = lj.Displaced(nodes=nodes, times=times, history=1e-4 * jnp.array([[0, 0, begin], [0, 0, 1.0]]))
+        plate = RigidPlate(nodes=nodes, times=times, turn=1e-2 * own.history)
+        assert order_of_steps(replace(loaded, traction=(own,))) == order
+        assert order_of_steps(replace(unloaded, displaced=(moved,))) == order
+        assert order_of_steps(replace(unloaded, physics=(plate,))) == order
     assert order_of_steps(unloaded) == order_of_steps(replace(block(0.1, 6, rise=None), viscosity=None)) == 2
 
 

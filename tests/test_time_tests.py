@@ -264,6 +264,35 @@ def test_a_test_without_relaxation_is_told_with_its_modulus(kind):
     assert not any("no relaxation" in w for w in found.warnings)
 
 
+def decayed(tau: np.ndarray, shares: np.ndarray, noise: float) -> TimeTest:
+    """A step of strain of 0.02 at 0 s on a fluid, and stresses until they have decayed to 0."""
+    t = np.linspace(0.1, 30, 300)
+    stress = 10 * np.exp(-t[:, None] / tau) @ shares + noise * np.random.default_rng(0).standard_normal(300)
+    return TimeTest("relaxation", np.append(0, t), np.full(301, 0.02), np.append(0, stress), np.arange(301) > 0)
+
+
+def test_a_rounded_response_that_has_decayed_to_zero_is_fitted():
+    """The scales of its zeros were 0, and the fit ended with a message about infinite numbers."""
+    test = decayed(np.array([0.5, 3.0]), np.array([0.6, 0.4]), 0.0)
+    test = test._replace(answer=np.round(test.answer / 0.5) * 0.5)
+    assert np.sum(test.answer == 0) > 200 and test.scales.min() > 0.5
+    model = fits.fit(test, 2).model
+    assert model.shear_modulus == pytest.approx(500, rel=0.1)
+    assert np.allclose(model.relaxation_times, [3.0, 0.5], rtol=0.2)
+
+
+@pytest.mark.parametrize("tau", [2.0, 6.0])
+def test_noise_after_the_decay_is_no_misfit(tau):
+    """With noise of 0.5 % of the largest stress, the fit was said to miss the data by 77 or 12 % on average."""
+    found = fits.fit(decayed(np.array([tau]), np.ones(1), 0.05))
+    assert found.model.relaxation_times == pytest.approx([tau], rel=0.02)
+    assert not any("misses the data" in w for w in found.warnings) and 0.004 < found.relative_errors.mean() < 0.04
+    wrong = found._replace(fitted=0.8 * found.fitted)  # a true misfit is not hidden
+    assert 0.2 < wrong.relative_errors.mean() < 0.3
+    plateau = found._replace(measured=found.measured + 0.9)  # nor are values above the noise that the fit misses
+    assert len(plateau.relative_errors) == len(plateau.measured)
+
+
 @pytest.mark.parametrize("noise", [0.01, 0.2])
 def test_the_mean_error_of_a_noisy_test_is_its_noise(noise):
     """The reported error stayed near 2 %, because the lower bound of the scales grew with the noise."""

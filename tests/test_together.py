@@ -327,6 +327,17 @@ def test_further_sweeps_lose_the_points_of_the_instrument_too(tmp_path):
         command.read_any(options, tmp_path / "no.csv")
 
 
+def test_the_largest_error_has_the_divisors_of_the_mean(found):
+    """The stress of a cycle passes through 0. There, the largest error of a good fit was given as 80 %."""
+    time = np.linspace(0, 20, 100)
+    strain = 0.01 * np.sin(np.pi / 2 * time)
+    stress = np.asarray(time_response.stress_response(TRUTH, time, strain))
+    noisy = stress + 0.01 * stress.max() * np.random.default_rng(2).standard_normal(100)
+    cycle = TimeTest("relaxation", time, strain, noisy, time > 0)
+    largest = together_report._largest(found._replace(tests=[cycle], fitted=[stress[1:]]))
+    assert largest == [together.relative_errors_of(cycle, stress[1:]).max()] and 0.02 < largest[0] < 0.1
+
+
 def test_what_no_fit_follows_is_told():
     """A test with a misfit of 63 % in the common fit and of 44 % alone does not disagree with the others."""
     share = together.Share("sweep", "b.csv", 38, 1.2, 1.0, 0.63, 0.44, 0.3, np.ones(3))

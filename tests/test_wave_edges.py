@@ -156,10 +156,9 @@ def test_the_derivative_by_the_edges_is_the_difference(monkeypatch):
     monkeypatch.setattr(edge_places, "FARTHER", 0.02)
     field = beside_a_cylinder(0.005, (3e-4, -4e-4), 2e-3, 100.0, voxels_across=13)
     own = organ_of(field)
-    s = [
-        edge_places.places(field.labels, own.body, np.array([1, 2]), farther) for farther in (0.0, edge_places.FARTHER)
-    ]
-    m = edges.region_matrices(own.matrices, own.body, DENSITY, *s)
+    given = field.labels, own.body, np.array([1, 2])
+    moved = edge_places.moved_edges(*given)
+    m = edges.region_matrices(own.matrices, own.body, DENSITY, edge_places.places(*given), moved)
     at = np.array([3000 + 600j, 9000 + 600j]), own.waves.omega[0], own.waves.motion[0], own.waves.sd[0]
     here = regions._state_of_regions(m, *at)
     there = regions._state_of_regions(m.farther._replace(patches=m.patches, patch=m.patch, kinks=m.kinks), *at)
@@ -231,8 +230,24 @@ def test_edges_move_as_far_as_is_said():
     alone = edge_places.places(np.ones_like(labels), body, np.array([1]), 0.1)  # one label has no edge to move
     np.testing.assert_allclose(alone, 1)
     near = np.flatnonzero(np.abs(r[tuple(body.voxel.T)] - 5) < 1)
-    patches, of_node = edge_places.patches_of(edge_places.places(labels, body, known), body, near)
+    rank = edge_places.ranks_of_regions(labels, body, known)
+    patches, of_node = edge_places.patches_of(edge_places.places(labels, body, known), rank, body, near)
     assert np.all(patches.region[of_node[near]] == 2)  # the edge of the core, on both of its sides
+
+
+def test_an_edge_between_regions_of_nearly_equal_size_belongs_to_the_region_it_is_moved_out_of():
+    """The labels ranked the regions for the shift, and the smoothed edges ranked them for the patches. The shift was
+    then stated for the other region, with the wrong sign."""
+    X = np.stack(np.meshgrid(*[np.arange(15)] * 3, indexing="ij"), axis=-1)
+    body, known = voxels.voxel_body(np.ones(X.shape[:3], bool), np.ones(3)), np.array([1, 2])
+    labels = 1 + (X[..., 0] > 7 + np.sin(1.1 * X[..., 1] + 0.3) * np.cos(1.1 * X[..., 2]))
+    s, moved = edge_places.places(labels, body, known), edge_places.moved_edges(labels, body, known)
+    sizes = [np.bincount(own) for own in (labels.ravel() - 1, s.argmax(axis=0))]
+    assert np.argmin(sizes[0]) == 1 and np.argmin(sizes[1]) == 0
+    near = np.flatnonzero(np.abs(s[0] - s[1]) < 0.5)
+    patches, _ = edge_places.patches_of(s, moved.rank, body, near)
+    grown = np.argmax(np.sum((moved.s - s)[:, near], axis=1))
+    assert np.all(patches.region == grown)
 
 
 @pytest.mark.slow
@@ -308,7 +323,8 @@ def test_what_labels_and_elements_do_to_a_cylinder(radius, most, edges_do, monke
                 s = [edge_places.places(field.labels, own.body, known, far) for far in out]
             else:
                 s = [in_its_true_place(field, radius, centre, far) for far in out]
-            m = edges.region_matrices(own.matrices, own.body, DENSITY, *s)
+            moved = edge_places.MovedEdges(s[1], edge_places.ranks_of_regions(field.labels, own.body, known))
+            m = edges.region_matrices(own.matrices, own.body, DENSITY, s[0], moved)
             found = regions.moduli_of_regions(m, own.waves, np.array([SOFT, STIFF]) + 200j * np.pi)
             off.append(found.modulus[0, 1].real / STIFF - 1)
     patches, whole, true = np.abs(np.reshape(off, (2, 3))).max(axis=0)

@@ -11,7 +11,7 @@ from test_wave_commands import written
 from test_waves import HERTZ, H, plane_waves
 
 from fitting.waves import wave_field
-from fitting.waves.files import formats
+from fitting.waves.files import formats, unwrapping
 from liverjax.core.errors import InputError
 
 pytestmark = pytest.mark.quick_to_compile
@@ -158,6 +158,19 @@ def test_wrapped_phases_are_unwrapped(tmp_path):
     steep, left, _ = wave_field.read_waves(tmp_path / "steep.npz").notes
     assert "Remove these voxels from the mask" in left
     assert re.match(r"frequency 2 of 2: [\d.]+ % of neighbouring voxels differ by nearly pi", steep)
+
+
+def test_separate_parts_of_a_mask_are_unwrapped_on_their_own():
+    """Each part has its own multiple of 2 pi at every instant. Only the median of all voxels was made continuous."""
+    pytest.importorskip("skimage")
+    t, x = np.arange(16) / 16, np.arange(12)[:, None, None, None]
+    exact = np.stack([6 * np.cos(2 * np.pi * one + 0.1 * x + np.zeros((12, 4, 4, 3))) for one in t])[None]
+    exact[:, :, 5:7] = np.nan
+    exact[:, :5, 0, 0, 0] = np.nan  # a voxel without a phase at some instants
+    found, notes = unwrapping.unwrapped("waves", np.angle(np.exp(1j * exact)))
+    assert not notes and np.array_equal(np.isnan(found), np.isnan(exact))
+    off = (found - exact)[0, ..., 1:, :]
+    np.testing.assert_allclose((off - off[:1])[np.isfinite(off)], 0, atol=1e-12)  # constant in time in each part
 
 
 def test_phases_of_air_are_not_unwrapped(tmp_path):

@@ -167,6 +167,18 @@ def test_the_noise_of_the_data_is_found():
     np.testing.assert_allclose(wave_field.noise_of(field), 4e-7, rtol=0.1)
 
 
+def test_a_component_that_is_zero_everywhere_does_not_lower_the_noise():
+    """A third of the differences were exact zeros, and the noise was half as large."""
+    rng, shape = np.random.default_rng(0), (1, 11, 11, 11, 3)
+    field, U = plane_waves((11, 11, 11)), 1e-7 * (rng.normal(size=shape) + 1j * rng.normal(size=shape))
+    U[..., 2] = 0
+    one = field._replace(frequencies=HERTZ[:1], displacement=U)
+    np.testing.assert_allclose(wave_field.noise_of(one), 1e-7, rtol=0.1)
+    real = one._replace(displacement=U.real + 0j)
+    np.testing.assert_allclose(wave_field.noise_of(real), 1e-7, rtol=0.1)
+    assert np.isnan(wave_field.noise_of(one._replace(displacement=0 * U)))
+
+
 def test_means_of_voxels_keep_the_modulus_and_lower_the_noise():
     field = plane_waves((14, 14, 14), noise=1e-7)
     half = wave_field.coarsened(field, 2)

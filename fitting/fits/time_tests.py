@@ -19,7 +19,7 @@ from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.host import Array, arrays_of
 from fitting.methods.least_squares import Solution, from_starts
-from fitting.readers.noise_of_series import noise_of_series
+from fitting.readers.noise_of_series import noise_of_series, rounding_of_series
 from fitting.readers.time_tests import TimeTest
 from fitting.waves import shear_waves
 from liverjax.core.errors import InputError
@@ -38,6 +38,9 @@ INDEPENDENT = "independent_answers"
 CONSTANT_NOISE = "noise_of_constant_size"
 #: Number of starting points of a fit.
 STARTS = 12
+#: A response has decayed if the fitted and the measured value are below the first number times the noise, and also
+#: below the second number times the largest measured value.
+_DECAYED = 10.0, 0.1
 
 
 class TimeFit(NamedTuple):
@@ -65,8 +68,9 @@ class TimeFit(NamedTuple):
 
     @property
     def relative_errors(self) -> np.ndarray:
-        """Relative errors (m,): |fit - data|, divided by `relative_sizes`."""
-        return np.abs(self.fitted - self.measured) / relative_sizes(self.measured, self.fitted, self.scales)
+        """Relative errors (k,) of the k values that count: |fit - data|, divided by the finite `relative_sizes`."""
+        sizes = relative_sizes(self.measured, self.fitted, self.scales)
+        return (np.abs(self.fitted - self.measured) / sizes)[np.isfinite(sizes)]
 
 
 def relative_sizes(measured: np.ndarray, fitted: np.ndarray, scales: np.ndarray) -> np.ndarray:
@@ -75,11 +79,40 @@ def relative_sizes(measured: np.ndarray, fitted: np.ndarray, scales: np.ndarray)
 
     If the response changes sign, as in cycles, the divisors are the scales of the residuals. In other tests, these
     scales would hide noise, because the lower bound of the scales is 33 times the noise.
+
+    A value does not count if the response has decayed into its noise, because then its relative error is large for any
+    model. Its divisor is infinite. See `_DECAYED`.
     """
     largest = np.abs(measured).max(initial=0.0)
     if min(measured.max(initial=0.0), -measured.min(initial=0.0)) > 0.1 * largest:
         return scales
-    return np.hypot(fitted, max(float(np.median(np.abs(fitted - measured))), 1e-300))
+    off, size = fitted - measured, np.maximum(np.abs(fitted), np.abs(_median_of_five(measured)))
+    decayed = size < _size_of_decayed(measured, off)
+    return np.where(decayed, np.inf, np.hypot(fitted, max(float(np.median(np.abs(off))), 1e-300)))
+
+
+def sizes_of_prediction(measured: np.ndarray, predicted: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    """Return the divisors (m,) for the relative errors of a test that was not fitted. Unlike `relative_sizes`, they do
+    not grow with the error of the prediction. A value does not count (infinite divisor) if both the measured and the
+    predicted response have decayed into the noise."""
+    largest = np.abs(measured).max(initial=0.0)
+    if min(measured.max(initial=0.0), -measured.min(initial=0.0)) > 0.1 * largest:
+        return scales
+    typical = np.abs(_median_of_five(measured))
+    least = _size_of_decayed(measured, predicted - measured)
+    return np.where(np.maximum(typical, np.abs(predicted)) < least, np.inf, np.maximum(typical, max(least, 1e-300)))
+
+
+def _median_of_five(values: np.ndarray) -> np.ndarray:
+    from scipy.ndimage import median_filter
+
+    return np.asarray(median_filter(values, min(5, len(values)), mode="nearest"))
+
+
+def _size_of_decayed(measured: np.ndarray, off: np.ndarray) -> float:
+    """Return the size below which a response has decayed (`_DECAYED`). `off`: fit minus data (m,)."""
+    noise = max(noise_of_series(off), rounding_of_series(measured))
+    return min(_DECAYED[0] * noise, _DECAYED[1] * float(np.abs(_median_of_five(measured)).max(initial=0.0)))
 
 
 @lru_cache(maxsize=8)

@@ -106,10 +106,17 @@ def sizes_of(test: Measured) -> np.ndarray:
     return scales if isinstance(test, TimeTest) else measured
 
 
-def _sizes_beside(test: Measured, fitted: np.ndarray) -> np.ndarray:
-    """Return the divisors for relative errors (`sizes_of`) of a test, if the fit predicts the values `fitted`."""
+def sizes_beside(test: Measured, fitted: np.ndarray) -> np.ndarray:
+    """Return the divisors for relative errors (`sizes_of`) of a test, if the fit predicts the values `fitted`. The
+    divisor is infinite for a value that does not count (`time_tests.relative_sizes`)."""
     sizes = sizes_of(test)
     return time_tests.relative_sizes(reported_numbers(test)[1], fitted, sizes) if isinstance(test, TimeTest) else sizes
+
+
+def relative_errors_of(test: Measured, fitted: np.ndarray) -> np.ndarray:
+    """Return the relative errors (k,) of the k values of a test that count, if the fit predicts the values `fitted`."""
+    sizes = sizes_beside(test, fitted)
+    return (np.abs(fitted - reported_numbers(test)[1]) / sizes)[np.isfinite(sizes)]
 
 
 def least_noise(test: Measured) -> float:
@@ -254,8 +261,8 @@ def misfits(
     left = np.split(residuals[: sum(counts)], np.cumsum(counts)[:-1])
     shares, fitted = [], []
     for test, (_, y, scales), r, s in zip(tests, data, left, noise, strict=True):
-        errors = np.abs(r * scales) / _sizes_beside(test, y + r * scales)
-        misfit = _size_of_noise(errors, len(y) * (1 - free / sum(counts)))
+        errors = relative_errors_of(test, y + r * scales)
+        misfit = _size_of_noise(errors, len(errors) * (1 - free / sum(counts)))
         own = (name_of(test), test.source, len(y), float(s), np.nan, misfit, np.nan, float(errors.mean()))
         shares.append(Share(*own, errors_without=np.array([])))
         fitted.append(r * scales + y)
@@ -520,12 +527,12 @@ def shares_by_rows(
         root, _ = spread(jacobian[place != k], 1.0, slope)
         without = errors_and_correlation(root)[0]
         r, (_, y, scales) = alone(k)[: sum(counts)][place[: sum(counts)] == k], reported_numbers(fit.tests[k])
-        freedom = counts[k] - min(free, counts[k] / 2)
+        freedom, errors = counts[k] - min(free, counts[k] / 2), relative_errors_of(fit.tests[k], y + r * scales)
         unknown = ~(without < 1e3 * np.abs(values))
         out.append(
             share._replace(
                 alone=max(least_noise(fit.tests[k]), _size_of_noise(r, freedom)),
-                misfit_alone=_size_of_noise(r * scales / _sizes_beside(fit.tests[k], y + r * scales), freedom),
+                misfit_alone=_size_of_noise(errors, freedom * len(errors) / counts[k]),
                 errors_without=np.where(unknown, np.inf, without),
             )
         )

@@ -17,6 +17,9 @@ from fitting.methods.noise.alike_noise import Alike, along_rows
 from fitting.methods.noise.uneven_noise import uneven_root
 
 _GRID = 200
+#: The contact point is searched up to BEFORE times the range of the depths before the first depth. If the misfit is
+#: smallest at this limit, the search continues up to _FARTHEST_BEFORE times this range.
+BEFORE, _FARTHEST_BEFORE = 0.5, 30.0
 #: The contact point is searched up to this distance before the last depth, divided by the range of the depths.
 SHALLOWEST = 1e-3
 #: Distance of neighbouring contact points for a central difference, divided by the range of the depths.
@@ -89,11 +92,7 @@ def fit_contact(
         numbers, A = linear(start)
         return float(np.sum((force - A @ numbers) ** 2))
 
-    # The contact point may lie before the first measured depth, but not after the last one.
-    earliest = max(depth.min() - 0.5 * span, depth.max() - deepest + 2 * h)
-    grid = np.linspace(earliest, depth.max() - SHALLOWEST * span, _GRID)
-    k = int(np.argmin([misfit(start) for start in grid]))
-    low, high = grid[max(k - 1, 0)], grid[min(k + 1, _GRID - 1)]
+    low, high = _around_smallest_misfit(depth, depth.max() - deepest + 2 * h, misfit)
     start = float(
         scipy.optimize.minimize_scalar(misfit, bounds=(low, high), method="bounded", options={"xatol": 1e-9 * span}).x
     )
@@ -114,6 +113,22 @@ def fit_contact(
     errors = sizes[:2] * np.array([abs(E), span])  # E is negative if the force falls with the depth
     bases = float(offset), float(offset_error), float(tilt), float(tilt_error)
     return ContactFit(E, start, errors, correlation, noise, residuals, before, *bases, independent)
+
+
+def _around_smallest_misfit(depth: np.ndarray, limit: float, misfit: Callable[[float], float]) -> tuple[float, float]:
+    """Return two contact points [m] between which the misfit is smallest. No contact point before `limit` [m] is tried.
+
+    The contact point may lie before the first measured depth, but not after the last one.
+    """
+    first, span = float(depth.min()), float(np.ptp(depth))
+    grid = np.linspace(max(first - BEFORE * span, limit), depth.max() - SHALLOWEST * span, _GRID)
+    misfits = [misfit(start) for start in grid]
+    farthest = max(first - _FARTHEST_BEFORE * span, limit)
+    if np.argmin(misfits) == 0 and farthest < grid[0]:
+        far = (first - np.geomspace(first - farthest, BEFORE * span, _GRID))[:-1]
+        grid, misfits = np.append(far, grid), [*map(misfit, far), *misfits]
+    k = int(np.argmin(misfits))
+    return float(grid[max(k - 1, 0)]), float(grid[min(k + 1, len(grid) - 1)])
 
 
 def _errors_of_any_noise(J: np.ndarray, residuals: np.ndarray, noise: float) -> tuple[np.ndarray, float, Alike | None]:

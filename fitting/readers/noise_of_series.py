@@ -6,6 +6,10 @@ import numpy as np
 #: beside it, _NOISES times the noise, and _OF_LARGEST times the largest value.
 _FAR, _NOISES, _OF_LARGEST = 10.0, 20.0, 0.02
 _LOW = 0.5
+#: Two values are the same if they differ by less than this fraction of the largest value.
+_SAME = 1e-9
+#: A series counts as rounded if at least this fraction of its neighbouring values are the same.
+_OFTEN_SAME = 0.25
 
 
 def noise_of_series(values: np.ndarray) -> float:
@@ -16,6 +20,19 @@ def noise_of_series(values: np.ndarray) -> float:
     """
     steps = np.abs(np.diff(values, 3))
     return float(np.median(steps)) / 0.6745 / np.sqrt(20) if len(steps) else 0.0
+
+
+def rounding_of_series(values: np.ndarray) -> float:
+    """Return the standard deviation of the rounding errors of a series (n,): the smallest change between neighbouring
+    values, divided by the root of 12. Returns 0 if few neighbouring values are the same (see `_OFTEN_SAME`).
+
+    If most values are the same because of rounding, `noise_of_series` is 0.
+    """
+    steps = np.abs(np.diff(values))
+    same = steps <= _SAME * np.abs(values).max(initial=0.0)
+    if np.all(same) or np.mean(same) < _OFTEN_SAME:
+        return 0.0
+    return float(steps[~same].min()) / np.sqrt(12)
 
 
 def sizes_of_series(values: np.ndarray) -> np.ndarray:

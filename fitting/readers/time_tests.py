@@ -7,7 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 from fitting.readers.base_line import OFFSET, RESTING, base_line
-from fitting.readers.noise_of_series import noise_of_series, sizes_of_series, told_of_far_values
+from fitting.readers.noise_of_series import (
+    noise_of_series,
+    rounding_of_series,
+    sizes_of_series,
+    told_of_far_values,
+)
 from fitting.readers.scattering_load import without_scatter
 from fitting.readers.tables.time_columns import FORMS, beyond_small, read_columns
 from liverjax.core.errors import InputError
@@ -15,9 +20,9 @@ from liverjax.core.errors import InputError
 #: A load below this fraction of the largest load counts as rest: its effect on the response is just as small.
 AT_REST = 0.01
 
-#: The scales of the residuals have a lower bound: the noise divided by RELATIVE, and in a cyclic test also CYCLIC times
-#: the largest response.
-RELATIVE, CYCLIC = 0.03, 0.1
+#: The scales of the residuals have a lower bound: the noise divided by RELATIVE, and also CYCLIC (in a cyclic test) or
+#: LEAST_SIZE times the largest response.
+RELATIVE, CYCLIC, LEAST_SIZE = 0.03, 0.1, 1e-6
 
 #: How the load changed where no row shows it. BETWEEN_ROWS: unknown; a linear change between rows is assumed.
 #: BEFORE_ROWS: unknown; the first row is already loaded, so a row at 0 s was added. GIVEN: the user gave the duration.
@@ -51,7 +56,8 @@ class TimeTest(NamedTuple):
 
     def _sizes_of_answers(self) -> np.ndarray:
         answer = self.answer[self.used]
-        floor = max(noise_of_series(answer) / RELATIVE, CYCLIC * float(np.max(np.abs(answer))) if self.cyclic else 0.0)
+        noise = max(noise_of_series(answer), rounding_of_series(answer))
+        floor = max(noise / RELATIVE, (CYCLIC if self.cyclic else LEAST_SIZE) * float(np.max(np.abs(answer))))
         return np.hypot(sizes_of_series(answer), floor)
 
     @property

@@ -1,15 +1,16 @@
 """Write the results of a fit to an indentation curve: fit.json and fit.png, and a table on the terminal."""
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fitting.methods.contact_point import ContactFit
+from fitting.methods.contact_point import BEFORE, ContactFit, fit_with_offset
 from fitting.methods.kramers_kronig import runs_probability
 from fitting.readers.indentation_curves import IndentationCurve
-from fitting.readers.noise_of_series import noise_of_series
+from fitting.readers.noise_of_series import noise_of_series, rounding_of_series
 from fitting.reports.sweep_report import numbers
 from fitting.rigs.thin_layer import Indenter, half_space
 from liverjax.core.files import write_whole
@@ -36,7 +37,7 @@ def write(
     """
     out.mkdir(parents=True, exist_ok=True)
     G, errors = fit.modulus / (2 * (1 + rig.poisson)), fit.standard_errors
-    alone = half_space(rig, curve.depth - fit.contact_point)
+    alone = fit_with_offset(curve.depth, curve.force, partial(half_space, rig))
     content = numbers(
         {
             "method": "indentation",
@@ -55,7 +56,7 @@ def write(
             "independent_points": fit.independent,
             "mean_relative_error": float(np.mean(np.abs(fit.residuals)) / np.max(np.abs(curve.force))),
             "max_relative_error": float(np.max(np.abs(fit.residuals)) / np.max(np.abs(curve.force))),
-            "half_space_young_modulus": float(alone @ (curve.force - fit.offset) / max(float(alone @ alone), 1e-300)),
+            "half_space_young_modulus": alone.modulus,
             "poisson": rig.poisson,
             "thickness": rig.thickness,
             "points_before_contact": fit.before,
@@ -86,6 +87,13 @@ def indentation_warnings(
     told, deepest = [], float(curve.depth.max() - fit.contact_point)
     if fit.before < 3:
         told.append(f"{fit.before} points are before contact: measure the approach too, to find the contact point")
+    ahead = float(curve.depth.min() - fit.contact_point)
+    if ahead > BEFORE * np.ptp(curve.depth):
+        told.append(
+            f"the fitted contact point lies {ahead:.3g} m before the first depth, outside the measured curve. A "
+            "force that is not 0 without contact has the same effect: begin the curve before contact, or subtract this "
+            "force"
+        )
     if level is not None:
         told.append(
             "the force rises or falls steadily before contact. The sensor drifts, and this drift changes modulus and "
@@ -120,7 +128,8 @@ def indentation_warnings(
             "points; the standard errors include this effect"
         )
     # The noise is estimated from neighbouring points, because the residuals contain the adhesion.
-    if curve.force.min() - min(fit.offset, 0.0) < -5 * noise_of_series(curve.force):
+    noise = max(noise_of_series(curve.force), rounding_of_series(curve.force))
+    if curve.force.min() - min(fit.offset, 0.0) < -5 * noise:
         told.append(
             "some forces are clearly negative: this is probably adhesion, which the model does not contain, or an "
             "error of the zero of the force"

@@ -11,6 +11,7 @@ from fitting.fits import time_tests
 from fitting.fits.together import Measured, name_of, reported_numbers, sizes_of
 from fitting.fits.viscoelastic import Fit
 from fitting.methods.generalised_maxwell import Maxwell
+from fitting.readers.frequency_sweep import Sweep
 from fitting.readers.noise_of_series import noise_of_series
 from fitting.readers.time_tests import TimeTest
 
@@ -25,8 +26,9 @@ class Prediction(NamedTuple):
     measured: np.ndarray  # (m,)
     standard_errors: np.ndarray  # (m,) of the predicted values; infinite if the fit does not determine a value
     scales: np.ndarray  # (m,) residuals are weighted by 1 / scales: standard deviations if the test has them
-    sizes: np.ndarray  # (m,) relative error = |predicted - measured| / sizes
+    sizes: np.ndarray  # (m,) relative error = |predicted - measured| / sizes; infinite if a value does not count
     inside: np.ndarray  # (m,) whether the point is in the band of the fitted sweep
+    noise: float  # noise of the measured values, divided by `scales`; NaN if the values are too few to estimate it
 
     @property
     def relative_errors(self) -> np.ndarray:
@@ -43,9 +45,10 @@ class Prediction(NamedTuple):
     @property
     def covered(self) -> float:
         """Fraction of the measured values in the band that lie within the 95 % interval of the prediction. The width of
-        this interval includes the scatter of the measured values."""
-        off = (self.predicted - self.measured)[self.inside]
-        own = self.scales[self.inside] * noise_of_series(off / self.scales[self.inside])
+        this interval includes the scatter of the measured values. NaN if this scatter is unknown."""
+        if np.isnan(self.noise):
+            return np.nan
+        off, own = (self.predicted - self.measured)[self.inside], self.noise * self.scales[self.inside]
         return float(
             np.mean(np.abs(off) < scipy.stats.norm.ppf(0.975) * np.hypot(self.standard_errors[self.inside], own))
         )
@@ -78,20 +81,35 @@ def predict(fit: Fit, resolved: tuple[float, float], test: Measured) -> Predicti
     inside = (place >= low * (1 - 1e-9)) & (place <= high * (1 + 1e-9))
     errors = np.where(errors < 1e30, errors, np.inf)
     predicted = np.asarray(answers(jnp.asarray(vector)))
-    return Prediction(name_of(test), test.source, predicted, measured, errors, scales, sizes_of(test), inside)
+    sizes = sizes_of(test)
+    if isinstance(test, TimeTest):
+        sizes = time_tests.sizes_of_prediction(measured, predicted, sizes)
+    noise = _scatter_around((predicted - measured) / scales, inside, test)
+    return Prediction(name_of(test), test.source, predicted, measured, errors, scales, sizes, inside, noise)
+
+
+def _scatter_around(off: np.ndarray, inside: np.ndarray, test: Measured) -> float:
+    """Return the noise of a test, divided by its scales. It is estimated from the differences `off` (m,) between
+    prediction and test. Those outside the band are used only if fewer than four are `inside` (m,). NaN for fewer than
+    four values without deviations."""
+    off = off[inside] if inside.sum() >= 4 else off
+    if isinstance(test, Sweep) and test.noise_given:
+        return max(1.0, noise_of_series(off))
+    return noise_of_series(off) if len(off) >= 4 else np.nan
 
 
 def sentence(found: Prediction) -> str:
     """Return one line about a prediction for the user."""
     share, inside = len(found.measured), int(found.inside.sum())
     name = f"{found.name} {found.source}"
-    if not inside:
-        return f"{name}: predicted, but all {share} values lie outside the band of the sweep"
-    off = 100 * found.relative_errors[found.inside].mean()
-    told = (
-        f"{name}: predicted within {off:.2g} % on average; {100 * found.covered:.0f} % of {inside} numbers lie in the "
-        f"95 % interval of the prediction"
-    )
+    counted = found.inside & np.isfinite(found.sizes)
+    if not counted.any():
+        where = "in the band have decayed into the noise" if inside else "lie outside the band of the sweep"
+        return f"{name}: predicted, but all {inside or share} values {where}"
+    off = 100 * found.relative_errors[counted].mean()
+    told = f"{name}: predicted within {off:.2g} % on average"
+    if not np.isnan(found.covered):
+        told += f"; {100 * found.covered:.0f} % of {inside} numbers lie in the 95 % interval of the prediction"
     if abs(found.factor - 1) > 0.005 * off:  # at least half of the error is one common factor
         told += f"; {found.factor:.3g} times the prediction would fit the test best"
     outside = share - inside

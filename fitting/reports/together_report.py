@@ -10,7 +10,7 @@ from fitting.fits.families import limits
 from fitting.fits.honesty import sizes_of_samples, total_error
 from fitting.fits.honesty.long_times import INTERVAL
 from fitting.fits.time_tests import thinned
-from fitting.fits.together import Share, Together
+from fitting.fits.together import Share, Together, relative_errors_of
 from fitting.methods.generalised_maxwell import moduli
 from fitting.methods.uncertainty import equilibrium_error
 from fitting.readers.frequency_sweep import Sweep
@@ -132,8 +132,7 @@ def _measured(found: Together, k: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _largest(found: Together) -> list[float]:
-    pairs = ((_measured(found, k)[1], fitted) for k, fitted in enumerate(found.fitted))
-    return [float(np.max(np.abs(f - y) / np.maximum(np.abs(y), 1e-3 * np.abs(y).max()))) for y, f in pairs]
+    return [float(relative_errors_of(*pair).max()) for pair in zip(found.tests, found.fitted, strict=True)]
 
 
 def table(found: Together, relative: float) -> str:

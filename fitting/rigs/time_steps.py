@@ -8,8 +8,15 @@ import numpy as np
 
 import liverjax as lj
 from liverjax.core import status
+from liverjax.core.history import entry_at
 from liverjax.core.struct import replace
-from liverjax.scenes.scene import Scene
+from liverjax.mesh.selection import AXES
+from liverjax.physics.contact.obstacle import Obstacle
+from liverjax.physics.contact.pressed import PressedObstacle
+from liverjax.physics.elastic_support import ElasticSupport
+from liverjax.physics.prescribed import Displaced
+from liverjax.physics.rigid_plate import RigidPlate
+from liverjax.scenes.scene import Scene, histories
 
 
 def order_of_steps(scene: Scene) -> int:
@@ -22,11 +29,25 @@ def order_of_steps(scene: Scene) -> int:
 
 
 def _begins_with_load(scene: Scene) -> bool:
-    """Return whether a load without a history acts from the first step on. It then rises during this step, so half the
-    step also halves the time of the rise."""
+    """Return whether a load or a prescribed motion is not 0 at the beginning. It then rises during the first step, so
+    half the step also halves the time of the rise."""
     loads = [own.value for own in scene.traction if own.times is None]
     if scene.body is not None and scene.body.times is None:
         loads.append(scene.body.gravity)
+    for part in histories(scene).values():
+        begin = np.asarray(entry_at(0.0, getattr(part, "times", None), getattr(part, "history", np.zeros(0))))
+        # A support whose stiffness changes has no tension at the beginning, and a moved obstacle may be far away.
+        if isinstance(part, ElasticSupport) and begin.ndim == 0:
+            continue
+        if isinstance(part, Obstacle) and not isinstance(part, PressedObstacle):
+            continue
+        if isinstance(part, Displaced):
+            moved = begin if part.by is None else np.asarray(part.by) * begin
+            begin = moved[..., [AXES.index(axis) for axis in part.axes]]
+        loads.append(begin)
+    for plate in scene.physics:
+        if isinstance(plate, RigidPlate):
+            loads.append(plate.turn if plate.times is None else entry_at(0.0, plate.times, plate.turn))
     return any(np.any(np.asarray(load) != 0) for load in loads)
 
 

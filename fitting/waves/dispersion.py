@@ -25,6 +25,9 @@ WORDS = (
     ("speed", "velocity"),
     ("attenuation", "attenuation"),
 )
+#: A column whose heading contains one of these words states the error of another column. Such a column is not read.
+ERRORS = {"sd", "std", "stdev", "stddev", "stderr", "se", "sem", "err", "error", "errors", "dev", "deviation"}
+ERRORS |= {"sigma", "uncertainty", "ci"}
 #: Number of neighbouring points to which a cubic is fitted. The residuals of these fits show the noise.
 _NEIGHBOURS = 5
 #: Relative scatter below this value may be the curvature of exact data.
@@ -148,16 +151,16 @@ def in_band(waves: Dispersion, low: float | None, high: float | None) -> Dispers
     )
 
 
-def _header(lines: list[str]) -> tuple[int, str, dict[str, tuple[int, str]]] | None:
-    """Return the index and the delimiter of the first line that names frequency and velocity, and the column and unit
+def _header(lines: list[str]) -> tuple[int, str, dict[str, list[tuple[int, str]]]] | None:
+    """Return the index and the delimiter of the first line that names frequency and velocity, and the columns and units
     of each quantity in this line. Return None if no line names both."""
     for k, line in enumerate(lines):
         delimiter, cells = split_line(line.lstrip("# "))
-        found: dict[str, tuple[int, str]] = {}
+        found: dict[str, list[tuple[int, str]]] = {}
         for place, cell in enumerate(cells):
             named = _quantity_named(cell)
             if named:
-                found.setdefault(named[0], (place, named[1]))
+                found.setdefault(named[0], []).append((place, named[1]))
         if {"frequency", "velocity"} <= set(found):
             return k, delimiter, found
     return None
@@ -165,9 +168,9 @@ def _header(lines: list[str]) -> tuple[int, str, dict[str, tuple[int, str]]] | N
 
 def _quantity_named(cell: str) -> tuple[str, str] | None:
     """Return quantity and unit of a heading, for example "Phase velocity (m/s)" or "attenuation_Np/m". An angular
-    frequency without a unit is in rad/s. Return None if the heading is not known."""
+    frequency without a unit is in rad/s. Return None if the heading is not known, or if it names an error."""
     parts = re.match(r'^"?([^\[(]*?)\s*(?:[\[(]\s*([^\])]*?)\s*[\])])?"?$', cell.strip())
-    if parts is None:
+    if parts is None or ERRORS & {word.lower() for word in re.findall("[A-Z]*[a-z]+|[A-Z]+", cell)}:
         return None
     name = parts.group(1).replace("_", " ").strip()
     for word, quantity in WORDS:
@@ -179,7 +182,11 @@ def _quantity_named(cell: str) -> tuple[str, str] | None:
 
 
 def _columns(path: str, lines: list[str], header: tuple) -> dict[str, np.ndarray]:
-    k, delimiter, found = header
+    k, delimiter, found = header[0], header[1], {q: columns[0] for q, columns in header[2].items()}
+    for quantity, columns in header[2].items():
+        if quantity != "frequency" and len(columns) > 1:  # of several columns of frequencies, the first one is used
+            places = ", ".join(str(place + 1) for place, _ in columns)
+            raise InputError(f"{path}: columns {places} may all contain {quantity}; keep one of these columns")
     factors = {}
     for quantity, (_, unit) in found.items():
         known = WAVE_UNITS[quantity]

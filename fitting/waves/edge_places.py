@@ -47,6 +47,13 @@ class Patches(NamedTuple):
         return np.asarray(np.bincount(self.region, values, regions) / np.maximum(count, 1))
 
 
+class MovedEdges(NamedTuple):
+    """Edges of R regions that are moved by `FARTHER` out of the smaller region on each edge."""
+
+    s: np.ndarray  # (R, V) smoothed indicator functions of the regions, from `places`
+    rank: np.ndarray  # (R,) rank of each region by its size, from `ranks_of_regions`
+
+
 NO_PATCHES = Patches(np.zeros(0, int), np.zeros((0, 3)))
 
 
@@ -69,18 +76,29 @@ def places(labels: np.ndarray, body: VoxelBody, known: np.ndarray, farther: floa
     nearest = ndimage.distance_transform_edt(~measured, return_distances=False, return_indices=True)
     whole = labels[tuple(nearest)]
     s = np.array([_smoothed(whole == label) for label in known])
-    counts, sizes = ([int(np.sum(own == label)) for label in known] for own in (whole, labels[measured]))
-    rank, out = np.argsort(np.argsort(sizes, kind="stable")), s.copy()  # the largest region has the highest rank
+    rank, out = ranks_of_regions(labels, body, known), s.copy()
     for k in range(len(known)):
         if rank[k] < len(known) - 1:
             others = np.delete(s, k, axis=0).max(axis=0)
             # The constant is added only near this region. A small region needs a large constant, and elsewhere this
             # constant would move the edges of other regions.
             apart = ndimage.distance_transform_edt(whole != known[k])
-            out[k] += _level(s[k] - others, whole == known[k], counts[k]) * np.clip(2 - 0.5 * apart, 0, 1)
+            out[k] += _level(s[k] - others, whole == known[k]) * np.clip(2 - 0.5 * apart, 0, 1)
     if farther:
         out = _moved_out(out, rank, farther)
     return np.asarray(out[(slice(None), *body.voxel.T)])
+
+
+def ranks_of_regions(labels: np.ndarray, body: VoxelBody, known: np.ndarray) -> np.ndarray:
+    """Return the rank (R,) of each label in `known` by its number of voxels in the body. The largest region has the
+    highest rank. The arguments are those of `places`."""
+    own = labels[tuple(body.voxel.T)]
+    return np.argsort(np.argsort([np.sum(own == label) for label in known], kind="stable"))
+
+
+def moved_edges(labels: np.ndarray, body: VoxelBody, known: np.ndarray) -> MovedEdges:
+    """Return the edges that are moved by `FARTHER`. The arguments are those of `places`."""
+    return MovedEdges(places(labels, body, known, FARTHER), ranks_of_regions(labels, body, known))
 
 
 def _moved_out(s: np.ndarray, rank: np.ndarray, farther: float) -> np.ndarray:
@@ -104,10 +122,10 @@ def _smoothed(place: np.ndarray) -> np.ndarray:
     return 2 * once - ndimage.gaussian_filter(once, SMOOTHING, mode="nearest")
 
 
-def _level(above: np.ndarray, place: np.ndarray, count: int) -> float:
+def _level(above: np.ndarray, place: np.ndarray) -> float:
     """Return the constant that must be added to the field `above` near a label. With this constant, the volume where
-    the field is positive is the volume of the label (`count` voxels)."""
-    reach = ndimage.find_objects(place.astype(int))[0]
+    the field is positive is the volume of the label. `place` (nx, ny, nz) states which voxels have this label."""
+    count, reach = int(np.sum(place)), ndimage.find_objects(place.astype(int))[0]
     box = tuple(slice(max(0, r.start - 2), r.stop + 2) for r in reach)
     # The values are interpolated linearly between the centres of the voxels, at several points within each voxel.
     inside = [np.clip(np.arange(n * FINE) / FINE + (0.5 / FINE - 0.5), 0, n - 1) for n in above[box].shape]
@@ -115,7 +133,7 @@ def _level(above: np.ndarray, place: np.ndarray, count: int) -> float:
     return -float(np.partition(fine.ravel(), -count * FINE**3)[-count * FINE**3])
 
 
-def patches_of(s: np.ndarray, body: VoxelBody, nodes: np.ndarray) -> tuple[Patches, np.ndarray]:
+def patches_of(s: np.ndarray, rank: np.ndarray, body: VoxelBody, nodes: np.ndarray) -> tuple[Patches, np.ndarray]:
     """Return the patches of the edges near given nodes, and the index of the nearest patch for each node (V,). The
     index is -1 for nodes that are not given.
 
@@ -123,13 +141,13 @@ def patches_of(s: np.ndarray, body: VoxelBody, nodes: np.ndarray) -> tuple[Patch
 
     Args:
         s: smoothed indicator functions (R, V) from `places`.
+        rank: rank of each region (R,) by its size, from `ranks_of_regions`. `places` uses the same ranks to move edges.
         body: the body of the nodes.
         nodes: indices of the nodes of cut elements.
     """
     of_node = np.full(body.mesh.number_of_nodes, -1)
     if len(s) < 2 or not len(nodes):
         return NO_PATCHES, of_node
-    rank = np.argsort(np.argsort(np.bincount(s.argmax(axis=0), minlength=len(s)), kind="stable"))
     highest = np.argsort(s[:, nodes], axis=0)[-2:]  # the two regions at the edge
     region = np.where(rank[highest[0]] < rank[highest[1]], *highest)
     foot = np.empty((len(nodes), 3))

@@ -22,7 +22,7 @@ import scipy.sparse
 
 from fitting.waves import balance, edge_places
 from fitting.waves.balance import Matrices
-from fitting.waves.edge_places import NO_PATCHES, Patches, patches_of
+from fitting.waves.edge_places import NO_PATCHES, MovedEdges, Patches, patches_of
 from fitting.waves.voxels import VoxelBody
 from liverjax.mesh.adjacency import PAIRS
 
@@ -91,7 +91,7 @@ class _CutElements(NamedTuple):
 
 
 def region_matrices(
-    m: Matrices, body: VoxelBody, density: float, s: np.ndarray, farther: np.ndarray | None = None
+    m: Matrices, body: VoxelBody, density: float, s: np.ndarray, farther: MovedEdges | None = None
 ) -> RegionMatrices:
     """Return the matrices for the balance of forces in a body with R regions.
 
@@ -99,11 +99,11 @@ def region_matrices(
         m, body: the result of `balance.matrices`, and the body for which this result was computed.
         density: [kg/m^3].
         s: smoothed indicator functions (R, V) from `edge_places.places`.
-        farther: the same functions with edges moved outwards by `edge_places.FARTHER`. If it is None, the edges have
-            the fixed positions that `s` gives.
+        farther: the same regions with edges moved outwards, from `edge_places.moved_edges`. If it is None, the edges
+            have the fixed positions that `s` gives, and the result has no patches.
     """
     nodes, tets = _nodes_of_elements(body), np.asarray(body.linear.tetrahedra)
-    both = [s] if farther is None else [s, farther]
+    both = [s] if farther is None else [s, farther.s]
     own = np.concatenate([each.argmax(axis=0)[nodes] for each in both])
     cut = np.flatnonzero(np.any(own != own[0], axis=0))
     kinked = np.unique(tets[cut])
@@ -112,7 +112,9 @@ def region_matrices(
     kinked = kinked[alive]
     rows = _numbers_of_rows(body, kinked)
     whole = _whole_parts(m, body, own[0], np.setdiff1d(np.arange(nodes.shape[1]), cut), density)
-    patches, of_node = patches_of(s, body, np.unique(nodes[:, cut]))
+    patches, of_node = NO_PATCHES, np.full(body.mesh.number_of_nodes, -1)
+    if farther is not None:
+        patches, of_node = patches_of(s, farther.rank, body, np.unique(nodes[:, cut]))
     at = np.concatenate([np.arange(body.mesh.number_of_nodes), kinked])
     patch, known = np.full(int(rows.max()) + 1, -1), rows >= 0
     patch[rows[known]] = np.repeat(of_node[at], 3)[known]

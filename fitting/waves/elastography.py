@@ -167,8 +167,8 @@ def regions_of(
     known = np.unique(labels[tuple(body.voxel.T)])
 
     def of_parts() -> Regions:
-        each = [edge_places.places(labels, body, known, farther) for farther in (0.0, edge_places.FARTHER)]
-        matrices = edges.region_matrices(m, body, organ.density, *each[: len(known)])
+        moved = edge_places.moved_edges(labels, body, known) if len(known) > 1 else None
+        matrices = edges.region_matrices(m, body, organ.density, edge_places.places(labels, body, known), moved)
         start = np.full(len(known), whole.modulus[0, 0])
         return regions.moduli_of_regions(matrices, waves, start, progress, body.voxel)
 

@@ -357,24 +357,26 @@ def noise_of(field: WaveField) -> np.ndarray:
     """Estimate the standard deviation (F,) [m] of the noise in the real and the imaginary part of one component.
 
     The estimate is the scaled median of fourth differences along the axis with the smallest differences. A few bad
-    voxels hardly change a median. A smooth wave contributes only (k h)^4 / 8 of its amplitude, with the wave number k
-    and the voxel spacing h. This is 0.12 % for 20 voxels per wavelength, and 4 % for 8. The result is NaN if the mask
-    has too few rows of five voxels.
+    voxels hardly change a median. A real or imaginary part of a component that is exactly 0 in all voxels is not used,
+    because its zeros contain no noise. A smooth wave contributes only (k h)^4 / 8 of its amplitude, with the wave
+    number k and the voxel spacing h. This is 0.12 % for 20 voxels per wavelength, and 4 % for 8. The result is NaN if
+    the mask has too few rows of five voxels.
     """
     out = np.full(len(field.frequencies), np.nan)
     for f, U in enumerate(field.displacement):
-        U = np.where(field.mask[..., None], U, np.nan)
+        known = field.mask[..., None] & np.isfinite(U)
+        every = np.concatenate([np.where(known, part, np.nan) for part in (U.real, U.imag)], axis=-1)
+        every = every[..., np.any(np.nan_to_num(every) != 0, axis=(0, 1, 2))]
         best = np.nan
         for a in range(3):
-            if U.shape[a] < 5:
+            if every.shape[a] < 5:
                 continue
-            rows = np.moveaxis(U, a, 0)
+            rows = np.moveaxis(every, a, 0)
             n = len(rows) - 4
             d = sum(w * rows[k : k + n] for k, w in enumerate(_FOURTH))
             d = d[np.isfinite(d)]
-            if d.size >= 30:
-                parts = np.abs(np.concatenate([d.real, d.imag]))
-                own = np.median(parts) / 0.6745 / np.sqrt(np.sum(_FOURTH**2))
+            if d.size >= 40:
+                own = np.median(np.abs(d)) / 0.6745 / np.sqrt(np.sum(_FOURTH**2))
                 best = own if np.isnan(best) else min(best, own)  # the wave contributes least along this axis
         out[f] = best
     return out

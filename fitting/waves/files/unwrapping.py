@@ -1,6 +1,7 @@
 """Unwrap phases that a scanner has wrapped into (-pi, pi]. Unwrapped phases are continuous in space and in time."""
 
 import numpy as np
+from scipy import ndimage
 
 from liverjax.core.errors import InputError
 
@@ -14,9 +15,9 @@ def unwrapped(name: str, phases: np.ndarray) -> tuple[np.ndarray, list[str]]:
     jumps are left, or if phases change so fast from voxel to voxel that jumps cannot be distinguished from waves.
 
     In space, pairs of neighbouring voxels are unwrapped in the order of their reliability (Herraez et al. 2002, Appl.
-    Opt. 41, 7437). After this, a multiple of 2 pi may still be missing in the phase of a whole volume. This
-    multiple is chosen under the assumption that the median phase changes by less than pi from one instant of the period
-    to the next.
+    Opt. 41, 7437). After this, a multiple of 2 pi may still be missing in the phase of a whole part of the volume. A
+    part is a set of connected voxels, for example one of two organs. Its multiple is chosen under the assumption that
+    its median phase changes by less than pi from one instant of the period to the next.
 
     Args:
         name: name of the file, for the messages.
@@ -40,14 +41,27 @@ def unwrapped(name: str, phases: np.ndarray) -> tuple[np.ndarray, list[str]]:
         one = phases[f, t, ..., c]
         volume = np.ma.masked_array(np.nan_to_num(one), np.isnan(one))  # with NaN, `unwrap_phase` would run forever
         out[f, t, ..., c] = np.ma.filled(unwrap_phase(volume, rng=0), np.nan)
-    levels = np.nanmedian(out, axis=(2, 3, 4))  # (F, T, 3)
     left = sum(int(np.sum(np.abs(np.diff(out, axis=a)) > np.pi)) for a in (2, 3, 4))
     notes = _of_steep_phases(phases)
     note = (
         f"{left} pairs of neighbouring voxels still differ by more than pi after unwrapping, so the waves are wrong "
         "there. Remove these voxels from the mask"
     )
-    return out + (np.unwrap(levels, axis=1) - levels)[:, :, None, None, None], notes + ([note] if left else [])
+    return _continuous_in_time(out), notes + ([note] if left else [])
+
+
+def _continuous_in_time(phases: np.ndarray) -> np.ndarray:
+    """Return phases (F, T, nx, ny, nz, 3) [rad] whose median is continuous in time, in every connected part of the
+    volume. A voxel belongs to a part if it is measured at all T instants."""
+    out = phases.copy()
+    for f, c in np.ndindex(phases.shape[0], phases.shape[-1]):
+        one = phases[f, ..., c]
+        part, count = ndimage.label(np.all(np.isfinite(one), axis=0))
+        levels = np.array([ndimage.median(each, part, np.arange(count + 1)) for each in one])  # (T, parts + 1)
+        shift = np.unwrap(levels, axis=0) - levels
+        shift[:, 0] = 0.0  # voxels that belong to no part
+        out[f, ..., c] += shift[:, part]
+    return out
 
 
 def _of_steep_phases(phases: np.ndarray) -> list[str]:
