@@ -233,6 +233,28 @@ def test_a_drift_that_may_not_continue_is_not_continued(case):
         assert found.left < 0 and found.level_error > 0.5
 
 
+def test_an_offset_needs_more_than_noise_of_similar_neighbours():
+    """The noise was taken as independent. With a correlation of 0.8, offsets that did not exist were found in 32 %."""
+    time = np.arange(-2.0, 0, 0.1)
+    for part, most in ((0.0, 0.03), (0.8, 0.15)):
+        rng = np.random.default_rng(0)
+        found = [base_line(time, 0.01 * _autoregression(rng, 20, part), 1.0, 1000.0) for _ in range(500)]
+        assert np.mean([line is not None and line.left == line.slope == 0 for line in found]) < most
+        lines = [base_line(time, 0.1 + 0.01 * _autoregression(rng, 20, part), 1.0, 1000.0) for _ in range(500)]
+        z = [(line.level - 0.1) / line.level_error for line in lines if line.left == line.slope == 0]
+        assert 0.8 < np.std(z) < (2.3 if part else 1.2)  # the old errors gave 3.5 and 1.1
+
+
+def test_the_error_of_equal_rows_at_rest_is_their_rounding(tmp_path):
+    """The error of an offset was 0 if the sensor repeated one value."""
+    time = np.arange(0.0, 40.0, 0.5)
+    strain = np.where(time > 9.75, 0.1, 0.0)
+    stress = np.round(0.5 + strain * (600 + 400 * np.exp(-(time - 10) / 5)) * 2) / 2
+    table = np.column_stack([time, strain, np.where(strain > 0, stress, 0.5)])
+    np.savetxt(tmp_path / "t.csv", table, delimiter=",", header="time_s,strain,stress_Pa", comments="")
+    assert np.isclose(reader.read_time_test(tmp_path / "t.csv", "relaxation").offset_error, 0.5 / np.sqrt(12))
+
+
 @pytest.mark.parametrize("rate", [0.01, pytest.param(-0.01, marks=pytest.mark.slow)])
 def test_a_drift_of_the_sensor_is_subtracted(rate, tmp_path):
     """The mean of the rows before the load was subtracted as an offset, although the sensor drifted. The equilibrium

@@ -514,3 +514,18 @@ def test_the_command_goes_on(tmp_path, capsys):
     again = json.loads((tmp_path / "out" / "field.json").read_text())
     name = "chi2_per_component"
     assert again["map"][name] <= 1.001 * first["map"][name]
+
+
+def test_numbers_with_two_dimensions_keep_their_shape(problem, monkeypatch):
+    """Displacements (V, 3) were given to the scene as one row, and were refused."""
+    seen = []
+    monkeypatch.setattr(scene_numbers, "fit", lambda problem, unknowns, **_: seen.append(unknowns) or [None])
+    mesh = lj.shapes.box((0.01, 0.01, 0.01), (1, 1, 1))
+    by = np.linspace(-1e-4, 1e-4, 12).reshape(4, 3)
+    moved = lj.Displaced(nodes=mesh.node_sets["x_max"], by=jnp.asarray(by))
+    scene = lj.Scene(mesh=mesh, law=lj.laws.Ogden(mu=(8.0, 2.0), alpha=(2.0, 3.0), bulk=30.0), displaced=(moved,))
+    scene_numbers.fit_numbers(problem._replace(scenes=(scene,)), ["displaced.0.by", "law.mu", "law.bulk"])
+    found = seen[0].values_of(jnp.asarray(seen[0].start))
+    np.testing.assert_allclose(found["displaced.0.by"], by, rtol=1e-12)
+    assert found["law.mu"] == (8.0, 2.0) and jnp.shape(found["law.bulk"]) == ()
+    assert seen[0].names[4:6] == ["displaced.0.by.4", "displaced.0.by.5"]

@@ -3,12 +3,16 @@
 import json
 
 import h5py
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
 
 from fitting.__main__ import main
 from fitting.fits import instrument, simulated_rheometer, viscoelastic
+from fitting.fits.families import models
+from fitting.fits.honesty import moduli_errors
 from fitting.methods import generalised_maxwell, uncertainty
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.frequency_sweep import Sweep
@@ -107,6 +111,40 @@ def test_what_is_corrected_comes_nearer_and_has_an_honest_error():
         )
     assert np.mean(mended) < 0.7 * np.mean(plain)
     assert 0.6 < np.sqrt(np.mean(np.square(z))) < 1.5
+
+
+def test_a_fit_of_bfgs_has_the_same_errors_of_the_instrument():
+    """They were not computed, without a message. BFGS returns its solution as JAX arrays."""
+    s = sweep(5e-4, 0)
+    found = viscoelastic.closed_form(s, 2)
+    start = found._replace(solution=jax.tree.map(jnp.asarray, found.solution))
+    fit, better = instrument.without_error_of_inertia(start, s)
+    assert better is not s
+    same = corrected(s)[0].details["instrument"]
+    assert fit.details["instrument"]["inertia_off_by"] == pytest.approx(same["inertia_off_by"], rel=1e-6)
+
+
+def test_the_other_models_are_fitted_again_after_a_correction():
+    """A correction removed the other models, and with them their part of the errors of the moduli."""
+    omega = np.geomspace(1, 100, 16)
+    share, rng = 4000 * (omega / 100) ** 2, np.random.default_rng(3)
+    G = generalised_maxwell.moduli(Maxwell(np.float64(2000.0), np.array([0.25, 0.2]), np.array([0.3, 0.03])), omega)
+    storage, loss = (g * (1 + 0.02 * rng.standard_normal(16)) for g in G)
+    s = Sweep(omega, storage - 0.03 * share, loss, inertia=share)
+    dense = generalised_maxwell.spectrum(s)
+    chosen = models.choose(s, "auto", viscoelastic.closed_form(s, 2, dense), dense)
+    factors = compression.shares(laws.typical("neo_hookean"), 0.2)
+    at_rest = instrument.of_compressed_sample(chosen, s, factors)
+    fit, better = instrument.without_error_of_inertia(at_rest, s, factors)
+    told = fit.details["instrument"]
+    assert abs(told["inertia_off_by"] - 0.03) < 2 * told["standard_error"] < 0.03 and better is not s
+    assert [f.kind.name for f in fit.rivals] == [f.kind.name for f in chosen.rivals]
+    rows = {row["model"]: row["information_criterion"] for row in fit.details["models_compared"]}
+    spectrum = models.spectrum_fit(better)
+    assert np.isclose(rows["spectrum"], viscoelastic.information_criterion(spectrum))
+    same = instrument.of_compressed_sample(spectrum, better, factors)
+    assert np.isclose(fit.rivals[-1].model.shear_modulus, same.model.shear_modulus)
+    assert 0.01 < moduli_errors.model_weights(fit)["spectrum"] < 0.5
 
 
 def test_a_prior_holds_what_the_data_do_not_say():

@@ -9,9 +9,12 @@ import pytest
 
 import liverjax as lj
 from fitting import __main__ as command
+from fitting.fits import instrument
+from fitting.fits.families import models
 from fitting.fits.simulated_rheometer import Simulation, rig_of
 from fitting.methods import generalised_maxwell
 from fitting.methods.generalised_maxwell import Maxwell, weighed
+from fitting.readers.frequency_sweep import Sweep
 from fitting.rigs import compression, glued, glued_compression, linear_torsion, torsion
 from fitting.waves.shear_waves import velocity_and_attenuation
 from liverjax.core.errors import InputError
@@ -27,6 +30,23 @@ REST = Maxwell(np.float64(1000.0), np.array([0.3, 0.2]), np.array([1.0, 0.1]))
 @pytest.fixture(scope="module")
 def law():
     return lj.laws.typical("neo_hookean")
+
+
+def test_warnings_about_the_modes_of_a_compressed_sample_have_its_moduli_at_rest(law):
+    """These warnings contained the moduli of the compressed sample."""
+    x = (0.1j * np.geomspace(0.1, 100, 24)) ** 0.3
+    G = 500 + 1200 * x / (1 + x)
+    G = G * (1 + 0.005 * np.random.default_rng(3).standard_normal(24))
+    sweep = Sweep(np.geomspace(0.1, 100, 24), G.real, G.imag)
+    fit = models.spectrum_fit(sweep)
+    coarse = "7 Prony modes represent the model spectrum only with errors of up to 5 %"
+    poor = fit._replace(details=fit.details | {"conversion": {"modes": 7, "largest_relative_error": 0.05}})
+    before = poor._replace(warnings=tuple(models.sentences_of_modes(poor)))
+    assert before.warnings[0].startswith(coarse)
+    found = instrument.of_compressed_sample(before, sweep, compression.shares(law, 0.25))
+    told = [w for w in found.warnings if "Prony modes" in w]
+    assert len(told) == 2 and not any(w.startswith(coarse) for w in told)
+    assert any(f"instantaneous modulus of the 7 Prony modes is {found.model.shear_modulus:.4g} Pa" in w for w in told)
 
 
 @pytest.mark.parametrize("strain", [0.05, 0.3])

@@ -91,6 +91,7 @@ def test_the_error_of_a_noisy_test_is_its_noise():
         other = s._replace(storage=factor * s.storage, loss=factor * s.loss)
         wrong = prediction.predict(viscoelastic.closed_form(other, 2), s.resolved, relaxation())
         assert wrong.relative_errors[wrong.inside].mean() == pytest.approx(abs(factor - 1), rel=1e-3)
+        assert f"{1 / factor:.3g} times the prediction would fit" in prediction.sentence(wrong)
     tail = found._replace(sizes=np.full(len(found.sizes), np.inf))
     assert "in the band have decayed into the noise" in prediction.sentence(tail)
 

@@ -425,12 +425,13 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
     dense = generalised_maxwell.refuse_impossible(sweep)
     writable(options.out, ("fit.json", "fit.png", "fit.h5"))
     closed = _closed(options, sweep, dense)
+    factors = None
     if options.precompression:
         factors = compression.shares(laws.typical(options.law), options.precompression)
         closed = instrument.of_compressed_sample(closed, sweep, factors)
     if options.friction_error:
         sweep = frequency_sweep.with_friction(sweep, options.friction_error, simulation.radius, simulation.height)
-    closed, corrected = instrument.without_error_of_inertia(closed, sweep)
+    closed, corrected = instrument.without_error_of_inertia(closed, sweep, factors)
     for note in corrected.notes[len(sweep.notes) :]:
         print(f"note: {note}", file=sys.stderr)
     # The error of the gap is included before the warnings are made, because the warnings use the errors.

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fitting.fits import simulated_rheometer, viscoelastic
+from fitting.fits.families import models
 from fitting.fits.honesty import total_error
 from fitting.fits.honesty.edges import HALF_DECADE
 from fitting.fits.viscoelastic import Fit, Kind
@@ -110,15 +111,18 @@ def nuisances_of(sweep: Sweep) -> list[Nuisance]:
     return out
 
 
-def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
+def without_error_of_inertia(fit: Fit, sweep: Sweep, factors: compression.Shares | None = None) -> tuple[Fit, Sweep]:
     """Fit the instrument's errors together with the Prony modes, and return the fit and the corrected sweep.
 
     The fit and the sweep are returned unchanged if the sweep has no data of the instrument, or if the model has no free
     Prony modes. If one of the errors changes when the upper end of the band is left out, all errors are reported, but
     the moduli are not corrected for them. If the number of modes was chosen automatically, more modes are tried, too.
+    If the modes were compared with other models, these models are fitted again to the corrected moduli. All these fits
+    use Levenberg-Marquardt, also if the first fit used BFGS. `factors`: as for `of_compressed_sample`, if the fit is
+    that of a compressed sample.
     """
     begin, known = time.perf_counter(), nuisances_of(sweep)
-    if not known or fit.kind.values is not None or not isinstance(fit.solution.u, np.ndarray):
+    if not known or fit.kind.values is not None:
         return fit, sweep
     weighed = _with_noise_as_measured(sweep)
     tried = [_errors_of_instrument(_fitted_again(fit, weighed), weighed), *_with_more_modes(fit, weighed)]
@@ -137,8 +141,12 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
     if viscoelastic.TRIED in details:
         refitted = _beside_more_modes(fit, refitted, tried, weighed)
     spread = _with_directions(refitted, corrected, known, best.covariance)
-    seconds = fit.run_time + time.perf_counter() - begin
-    return refitted._replace(uncertainty=spread, run_time=seconds), corrected
+    refitted = models.compared_again(
+        refitted._replace(uncertainty=spread),
+        corrected,
+        lambda other: other if factors is None else of_compressed_sample(other, corrected, factors),
+    )
+    return refitted._replace(run_time=fit.run_time + time.perf_counter() - begin), corrected
 
 
 def _with_more_modes(fit: Fit, sweep: Sweep) -> list[Corrected]:
@@ -335,7 +343,7 @@ def _errors_of_instrument(fit: Fit, sweep: Sweep, values: np.ndarray | None = No
 
 def _fitted_again(fit: Fit, sweep: Sweep) -> Fit:
     """Fit the modes to the corrected moduli of `sweep`. The search begins at the values of the modes in `fit`."""
-    return viscoelastic.modes_from(sweep, fit.solution.u[None], fit.kind)._replace(details=fit.details)
+    return viscoelastic.modes_from(sweep, np.asarray(fit.solution.u)[None], fit.kind)._replace(details=fit.details)
 
 
 def _halved_until_positive(sweep: Sweep, known: list[Nuisance], values: np.ndarray, step: np.ndarray) -> np.ndarray:
@@ -396,22 +404,17 @@ def of_compressed_sample(fit: Fit, sweep: Sweep, factors: compression.Shares) ->
     spread, own = viscoelastic.estimates(fit.solution, kind, data, fit.noise_root)
     modes = len(spread.values) // 2
     model = Maxwell(spread.values[0], spread.values[1 : modes + 1], spread.values[modes + 1 :])
-    old, new = (
-        ([], [])
-        if own is not None
-        else (uncertainty.cautions(sweep, of, kind.name) for of in (fit.uncertainty, spread))
-    )
-    warnings = (*(w for w in fit.warnings if w not in old), *new)
     rivals = tuple(of_compressed_sample(other, sweep, factors) for other in fit.rivals)
-    return fit._replace(
-        model=model,
-        kind=kind,
-        uncertainty=spread,
-        parameters=own,
-        warnings=warnings,
-        details=details,
-        rivals=rivals,
-    )
+    found = fit._replace(model=model, kind=kind, uncertainty=spread, parameters=own, details=details, rivals=rivals)
+    old, new = (_of_parameters(of, sweep) for of in (fit, found))
+    return found._replace(warnings=(*(w for w in fit.warnings if w not in old), *new))
+
+
+def _of_parameters(fit: Fit, sweep: Sweep) -> list[str]:
+    """Return the warnings of a fit that contain values of its parameters or of the Prony modes that represent it."""
+    if fit.parameters is None:
+        return uncertainty.cautions(sweep, fit.uncertainty, fit.kind.name)
+    return models.sentences_of_modes(fit)
 
 
 def _kind_at_rest(kind: Kind, factors: compression.Shares) -> Kind:

@@ -28,7 +28,7 @@ from fitting.fits.time_tests import INDEPENDENT, TimeFit
 from fitting.fits.viscoelastic import FLUID, Fit, Kind
 from fitting.methods import generalised_maxwell, springpots
 from fitting.methods.generalised_maxwell import Maxwell
-from fitting.methods.noise.uneven_noise import grouped_sizes
+from fitting.methods.noise.uneven_noise import sizes_shown
 from fitting.methods.sampling import tempering
 from fitting.methods.sampling.diagnostics import r_hat
 from fitting.methods.sampling.tempering import Chains, Density
@@ -368,7 +368,7 @@ def _with_noise_shown(fit: Fit, sweep: Sweep) -> Sweep:
     are correlated, because they may then be a misfit of the model."""
     J, r = np.asarray(fit.solution.jacobian), np.asarray(fit.solution.residuals)
     unknown = fit.noise_root is None or alike_points.INDEPENDENT in fit.details
-    sizes = None if unknown else grouped_sizes(J, r, np.arange(len(r)) >= len(r) // 2)
+    sizes = None if unknown else sizes_shown(J, r, np.concatenate(sweep.deviations))
     if sizes is None:
         return sweep
     first, second = (d * s for d, s in zip(sweep.deviations, np.split(sizes, 2), strict=True))

@@ -308,7 +308,7 @@ def fit_numbers(problem: Problem, names: Sequence[str], **options: Any) -> Estim
         p, out, k = natural_of(u), {}, 0
         for name, value, size in zip(names, starts, sizes, strict=True):
             part = p[k : k + size]
-            out[name] = part[0] if np.ndim(value) == 0 else tuple(part) if isinstance(value, tuple) else part
+            out[name] = tuple(part) if isinstance(value, tuple) else part.reshape(np.shape(value))
             k += size
         return out
 

@@ -60,6 +60,7 @@ class TimeFit(NamedTuple):
     compile_time: float
     details: Content
     parameters: Estimate | None = None  # parameters of another model; None: the modes are the parameters
+    rounding: float = 0.0  # `TimeTest.rounding`
 
     @property
     def modes(self) -> int:
@@ -69,11 +70,11 @@ class TimeFit(NamedTuple):
     @property
     def relative_errors(self) -> np.ndarray:
         """Relative errors (k,) of the k values that count: |fit - data|, divided by the finite `relative_sizes`."""
-        sizes = relative_sizes(self.measured, self.fitted, self.scales)
+        sizes = relative_sizes(self.measured, self.fitted, self.scales, self.rounding)
         return (np.abs(self.fitted - self.measured) / sizes)[np.isfinite(sizes)]
 
 
-def relative_sizes(measured: np.ndarray, fitted: np.ndarray, scales: np.ndarray) -> np.ndarray:
+def relative_sizes(measured: np.ndarray, fitted: np.ndarray, scales: np.ndarray, rounding: float = 0.0) -> np.ndarray:
     """Return the divisors (m,) of the relative errors of m values. A divisor is the root of the sum of two squares: the
     square of the fitted response, and the square of the median of |fit - data|.
 
@@ -87,11 +88,13 @@ def relative_sizes(measured: np.ndarray, fitted: np.ndarray, scales: np.ndarray)
     if min(measured.max(initial=0.0), -measured.min(initial=0.0)) > 0.1 * largest:
         return scales
     off, size = fitted - measured, np.maximum(np.abs(fitted), np.abs(_median_of_five(measured)))
-    decayed = size < _size_of_decayed(measured, off)
+    decayed = size < _size_of_decayed(measured, off, rounding)
     return np.where(decayed, np.inf, np.hypot(fitted, max(float(np.median(np.abs(off))), 1e-300)))
 
 
-def sizes_of_prediction(measured: np.ndarray, predicted: np.ndarray, scales: np.ndarray) -> np.ndarray:
+def sizes_of_prediction(
+    measured: np.ndarray, predicted: np.ndarray, scales: np.ndarray, rounding: float = 0.0
+) -> np.ndarray:
     """Return the divisors (m,) for the relative errors of a test that was not fitted. Unlike `relative_sizes`, they do
     not grow with the error of the prediction. A value does not count (infinite divisor) if both the measured and the
     predicted response have decayed into the noise."""
@@ -99,7 +102,7 @@ def sizes_of_prediction(measured: np.ndarray, predicted: np.ndarray, scales: np.
     if min(measured.max(initial=0.0), -measured.min(initial=0.0)) > 0.1 * largest:
         return scales
     typical = np.abs(_median_of_five(measured))
-    least = _size_of_decayed(measured, predicted - measured)
+    least = _size_of_decayed(measured, predicted - measured, rounding)
     return np.where(np.maximum(typical, np.abs(predicted)) < least, np.inf, np.maximum(typical, max(least, 1e-300)))
 
 
@@ -109,9 +112,9 @@ def _median_of_five(values: np.ndarray) -> np.ndarray:
     return np.asarray(median_filter(values, min(5, len(values)), mode="nearest"))
 
 
-def _size_of_decayed(measured: np.ndarray, off: np.ndarray) -> float:
+def _size_of_decayed(measured: np.ndarray, off: np.ndarray, rounding: float) -> float:
     """Return the size below which a response has decayed (`_DECAYED`). `off`: fit minus data (m,)."""
-    noise = max(noise_of_series(off), rounding_of_series(measured))
+    noise = max(noise_of_series(off), rounding_of_series(measured), rounding)
     return min(_DECAYED[0] * noise, _DECAYED[1] * float(np.abs(_median_of_five(measured)).max(initial=0.0)))
 
 
@@ -235,7 +238,7 @@ def _one_model(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind) -> Time
     spread = uncertainty.estimate(found, False, kind.maxwell, fluid=kind.name == FLUID.name)
     fitted = np.asarray(found.residuals) * scales + test.answer[rows]
     at = (test.time[rows], test.answer[rows], fitted, scales)
-    return TimeFit(kind, model, found, spread, bool(found.converged), *at, (), running, 0.0, {})
+    return TimeFit(kind, model, found, spread, bool(found.converged), *at, (), running, 0.0, {}, rounding=test.rounding)
 
 
 def refitted(fit: TimeFit, test: TimeTest) -> TimeFit:

@@ -110,7 +110,9 @@ def sizes_beside(test: Measured, fitted: np.ndarray) -> np.ndarray:
     """Return the divisors for relative errors (`sizes_of`) of a test, if the fit predicts the values `fitted`. The
     divisor is infinite for a value that does not count (`time_tests.relative_sizes`)."""
     sizes = sizes_of(test)
-    return time_tests.relative_sizes(reported_numbers(test)[1], fitted, sizes) if isinstance(test, TimeTest) else sizes
+    if not isinstance(test, TimeTest):
+        return sizes
+    return time_tests.relative_sizes(reported_numbers(test)[1], fitted, sizes, test.rounding)
 
 
 def relative_errors_of(test: Measured, fitted: np.ndarray) -> np.ndarray:

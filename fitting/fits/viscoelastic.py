@@ -15,7 +15,7 @@ from fitting.methods.generalised_maxwell import Maxwell, Spectrum
 from fitting.methods.host import Array
 from fitting.methods.least_squares import ZERO, Solution, bfgs, from_starts
 from fitting.methods.noise.factor_noise import factors_of_series
-from fitting.methods.noise.uneven_noise import grouped_root
+from fitting.methods.noise.uneven_noise import root_of_sizes, sizes_shown
 from fitting.readers.frequency_sweep import check_sweep
 from fitting.readers.rheometer import Sweep
 from liverjax.core.errors import InputError
@@ -187,7 +187,7 @@ def fit_at(sweep: Sweep, at: BestPoint, kind: Kind, seconds: tuple[float, float]
     compilation."""
     found, storage, loss = at.solution, at.storage, at.loss
     own_noise = not sweep.noise_given and kind.effective is None and len(found.residuals) == 2 * len(storage)
-    noise_root = root_of_noise_shown(found, sweep.angular_frequency) if own_noise else None
+    noise_root = root_of_noise_shown(found, sweep) if own_noise else None
     spread, own = estimates(found, kind, (2 * len(storage), sweep.noise_given), noise_root)
     sentences = _misfit(sweep, storage, loss, kind)
     sentences += tuple(uncertainty.cautions(sweep, spread, kind.name) if own is None else ())
@@ -241,13 +241,16 @@ def of_noise_shown(
     return estimate._replace(root=root, standard_errors=errors, correlation=correlation)
 
 
-def root_of_noise_shown(found: Solution, omega: np.ndarray) -> np.ndarray | None:
+def root_of_noise_shown(found: Solution, sweep: Sweep) -> np.ndarray | None:
     """Return the square root (p, k) of the covariance of the p unknowns u for the noise that the residuals show. This
-    may be noise that is correlated between repeated measurements at one frequency, or noise of different size in G' and
-    G''. Returns None if the residuals show no such noise."""
+    may be noise that is correlated between repeated measurements at one frequency, noise of different size in G' and
+    G'', or noise with one size in Pa. Returns None if the residuals show no such noise."""
     J, r = np.asarray(found.jacobian), np.asarray(found.residuals)
-    root = _of_repeats(J, r, omega)
-    return grouped_root(J, r, np.arange(len(r)) >= len(r) // 2, np.eye(J.shape[1])) if root is None else root
+    root = _of_repeats(J, r, sweep.angular_frequency)
+    if root is not None:
+        return root
+    sizes = sizes_shown(J, r, np.concatenate(sweep.deviations))
+    return None if sizes is None else root_of_sizes(J, sizes, np.eye(J.shape[1]))
 
 
 def _of_repeats(J: np.ndarray, r: np.ndarray, omega: np.ndarray) -> np.ndarray | None:

@@ -14,6 +14,8 @@ _POSSIBLE, _CLEAR = 2.5, 4.0
 _LONG, _LARGE = 0.2, 0.3
 #: The error of a drift is at least this fraction of it, because nothing shows how it continues under load.
 _CONTINUED = 0.5
+#: The estimated correlation between neighbouring responses is at most this number.
+_MOST_ALIKE = 0.95
 
 
 class BaseLine(NamedTuple):
@@ -26,7 +28,7 @@ class BaseLine(NamedTuple):
     left: float = 0.0  # slope of the rows at rest that is not subtracted, because it may not continue
 
 
-def base_line(time: np.ndarray, answer: np.ndarray, size: float, end: float) -> BaseLine | None:
+def base_line(time: np.ndarray, answer: np.ndarray, size: float, end: float, rounding: float = 0.0) -> BaseLine | None:
     """Return the base line that the rows at rest (n,) show, or None if it is not clearly different from 0.
 
     Args:
@@ -34,10 +36,13 @@ def base_line(time: np.ndarray, answer: np.ndarray, size: float, end: float) -> 
         answer: their responses (n,).
         size: the largest response of the whole test.
         end: time [s] of the last response of the test.
+        rounding: standard deviation of the rounding errors of these responses. A mean of equal responses still has this
+            error.
     """
     if len(time) < RESTING:
         return None
-    mean, error = float(np.mean(answer)), float(np.std(answer, ddof=1)) / np.sqrt(len(answer))
+    mean, error = _mean_at_rest(answer)
+    error = max(error, rounding)
     flat = BaseLine(mean, error) if abs(mean) > max(3 * error, OFFSET * size) else None
     if len(time) < DRIFTING or not np.ptp(time) > 0:
         return flat
@@ -53,11 +58,28 @@ def base_line(time: np.ndarray, answer: np.ndarray, size: float, end: float) -> 
     steady = abs(first - second) < 3 * np.hypot(e1, e2)
     small = abs(slope) * end < _LARGE * size
     if steady and small and rest > _LONG * end and abs(slope) > _CLEAR * slope_error:
-        return BaseLine(level, level_error, slope, max(slope_error, _CONTINUED * abs(slope)))
+        return BaseLine(level, max(level_error, rounding), slope, max(slope_error, _CONTINUED * abs(slope)))
     error = max(error, 0.5 * abs(slope) * rest)
     if steady and small:  # the whole drift is an error
         return BaseLine(mean, error, slope_error=abs(slope), left=slope)
     return BaseLine(mean, error, left=slope) if error > OFFSET * size else flat
+
+
+def _mean_at_rest(answer: np.ndarray) -> tuple[float, float]:
+    """Return the mean of responses (n,) and its standard error. The error contains the correlation between neighbouring
+    responses. An estimate r of this correlation is too small by about (1 + 4 r) / n, and this is corrected. n responses
+    cannot show how strong a correlation above 1 - 2 / n is. With this limit, the error is at most the scatter of the
+    responses. If the correlation is strong and n is 20 or less, the error is still too small."""
+    n, mean = len(answer), float(np.mean(answer))
+    r = _neighbours_alike(answer - mean)
+    alike = min(max(r + (1 + 4 * r) / n, 0.0), _MOST_ALIKE, 1 - 2 / n)
+    return mean, float(np.std(answer, ddof=1) * np.sqrt((1 + alike) / (1 - alike) / n))
+
+
+def _neighbours_alike(off: np.ndarray) -> float:
+    """Return the correlation between neighbouring residuals (n,), or 0 if all residuals are 0."""
+    square = float(off @ off)
+    return float(off[1:] @ off[:-1]) / square if square > 0 else 0.0
 
 
 def _straight_line(time: np.ndarray, answer: np.ndarray) -> tuple[float, float, float, float]:
@@ -66,8 +88,7 @@ def _straight_line(time: np.ndarray, answer: np.ndarray) -> tuple[float, float, 
     A = np.column_stack([np.ones(len(time)), time])
     found = np.linalg.lstsq(A, answer, rcond=None)[0]
     off = answer - A @ found
-    square = float(off @ off)
-    alike = min(max(float(off[1:] @ off[:-1]) / square, 0.0), 0.95) if square > 0 else 0.0
-    variance = square / (len(time) - 2) * (1 + alike) / (1 - alike)
+    alike = min(max(_neighbours_alike(off), 0.0), _MOST_ALIKE)
+    variance = float(off @ off) / (len(time) - 2) * (1 + alike) / (1 - alike)
     errors = np.sqrt(variance * np.diag(np.linalg.pinv(A.T @ A)))  # rounded times may all be equal
     return float(found[0]), float(found[1]), float(errors[0]), float(errors[1])

@@ -35,6 +35,17 @@ def rounding_of_series(values: np.ndarray) -> float:
     return float(steps[~same].min()) / np.sqrt(12)
 
 
+def rounding_at_rest(values: np.ndarray, whole: np.ndarray) -> float:
+    """Return the standard deviation of the rounding errors of the values (n,) of a sensor at rest, which may all be the
+    same: the smallest difference between the values `whole` (m,) of the complete test, divided by the root of 12.
+    Returns 0 if few neighbouring values at rest are the same (see `_OFTEN_SAME`)."""
+    least = _SAME * np.abs(whole).max(initial=0.0)
+    gaps = np.diff(np.sort(whole))
+    if len(values) < 2 or np.mean(np.abs(np.diff(values)) <= least) < _OFTEN_SAME or not np.any(gaps > least):
+        return 0.0
+    return float(gaps[gaps > least].min()) / np.sqrt(12)
+
+
 def sizes_of_series(values: np.ndarray) -> np.ndarray:
     """Return the absolute values (n,). A value below `_LOW` times the median of itself and its neighbours is replaced
     by this median.

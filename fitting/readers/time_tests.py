@@ -9,6 +9,7 @@ import numpy as np
 from fitting.readers.base_line import OFFSET, RESTING, base_line
 from fitting.readers.noise_of_series import (
     noise_of_series,
+    rounding_at_rest,
     rounding_of_series,
     sizes_of_series,
     told_of_far_values,
@@ -46,6 +47,9 @@ class TimeTest(NamedTuple):
     # the load, and error of the change per second.
     offset_error: float = 0.0
     drift_error: float = 0.0
+    # Standard deviation of the rounding errors of the responses, 0 if they are not rounded. It is found before the base
+    # line is subtracted, because rows with the same response differ after a drift is subtracted.
+    rounding: float = 0.0
 
     @property
     def scales(self) -> np.ndarray:
@@ -56,7 +60,7 @@ class TimeTest(NamedTuple):
 
     def _sizes_of_answers(self) -> np.ndarray:
         answer = self.answer[self.used]
-        noise = max(noise_of_series(answer), rounding_of_series(answer))
+        noise = max(noise_of_series(answer), rounding_of_series(answer), self.rounding)
         floor = max(noise / RELATIVE, (CYCLIC if self.cyclic else LEAST_SIZE) * float(np.max(np.abs(answer))))
         return np.hypot(sizes_of_series(answer), floor)
 
@@ -467,7 +471,8 @@ def _without_base_line(test: TimeTest) -> tuple[TimeTest, list[str]]:
     if count < RESTING:
         return test, _of_one_row_at_rest(test, size)
     time = test.time - test.begun
-    line = base_line(time[rest], test.answer[rest], size, float(time[-1]))
+    rounding = rounding_at_rest(test.answer[rest], test.answer[np.isfinite(test.answer)])
+    line = base_line(time[rest], test.answer[rest], size, float(time[-1]), rounding)
     if line is None:
         return test, []
     what, unit = ("stress", " Pa") if test.kind == "relaxation" else ("strain", "")
@@ -517,6 +522,7 @@ def _checked(test: TimeTest, start: float) -> TimeTest:
         word = "strain" if test.kind == "relaxation" else "stress"
         raise InputError(f"{test.source}: the {word} is zero throughout; give a {test.kind} test with a load")
     sign = np.sign(test.driven[np.argmax(np.abs(test.driven))])
+    recorded = test.answer
     test, told = _without_base_line(test)
     driven, answer = sign * test.driven, sign * test.answer
     used = test.used & np.isfinite(answer) & (test.time >= start) & (test.time > test.begun)
@@ -533,4 +539,5 @@ def _checked(test: TimeTest, start: float) -> TimeTest:
     if np.sum(test.time <= test.begun) > 2:
         told = [*told, f"the load begins at {test.begun:.3g} s: the rows before it are not fitted"]
     told = [*told, *told_of_far_values(test.time[used], driven[used], answer[used])]
-    return test._replace(driven=driven, answer=answer, used=used, notes=(*test.notes, *told))
+    test = test._replace(rounding=rounding_of_series(recorded[used]), notes=(*test.notes, *told))
+    return test._replace(driven=driven, answer=answer, used=used)

@@ -83,7 +83,7 @@ def predict(fit: Fit, resolved: tuple[float, float], test: Measured) -> Predicti
     predicted = np.asarray(answers(jnp.asarray(vector)))
     sizes = sizes_of(test)
     if isinstance(test, TimeTest):
-        sizes = time_tests.sizes_of_prediction(measured, predicted, sizes)
+        sizes = time_tests.sizes_of_prediction(measured, predicted, sizes, test.rounding)
     noise = _scatter_around((predicted - measured) / scales, inside, test)
     return Prediction(name_of(test), test.source, predicted, measured, errors, scales, sizes, inside, noise)
 
@@ -110,7 +110,8 @@ def sentence(found: Prediction) -> str:
     told = f"{name}: predicted within {off:.2g} % on average"
     if not np.isnan(found.covered):
         told += f"; {100 * found.covered:.0f} % of {inside} numbers lie in the 95 % interval of the prediction"
-    if abs(found.factor - 1) > 0.005 * off:  # at least half of the error is one common factor
+    with_factor = found._replace(predicted=found.factor * found.predicted)
+    if 100 * with_factor.relative_errors[counted].mean() <= 0.5 * off:
         told += f"; {found.factor:.3g} times the prediction would fit the test best"
     outside = share - inside
     also = "1 number outside the band is" if outside == 1 else f"{outside} numbers outside the band are"

@@ -6,7 +6,7 @@ model is converted to Prony modes. The details of a fit contain the largest erro
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,8 @@ from liverjax.core.struct import Content
 MODELS = ("prony", "fractional", "spectrum", "auto")
 #: Difference of the criterion that counts as very strong evidence (Kass and Raftery 1995, J. Am. Stat. Assoc. 90).
 STRONG = 10.0
-
+#: Key in `Fit.details` of the table of compared models.
+TABLE_OF_MODELS = "models_compared"
 
 #: An exponent is at its bound if its distance from 0 or 1 is below this value, unless its standard error is small.
 BOUND = 1e-3
@@ -128,17 +129,21 @@ def _conversion(sweep: Sweep, moduli: Any, solid: bool) -> as_prony_modes.Conver
 
 def _finished(fit: Fit, made: as_prony_modes.Conversion) -> Fit:
     """Return the fit with the error of the conversion to Prony modes, and with the warnings about the model."""
+    fit = fit._replace(details=fit.details | {"conversion": {"modes": fit.modes, "largest_relative_error": made.error}})
+    return fit._replace(warnings=(*fit.warnings, *sentences_of_modes(fit), *undetermined(fit)))
+
+
+def sentences_of_modes(fit: Fit) -> list[str]:
+    """Return the warnings about the Prony modes that represent a springpot model or a spectrum."""
     endless = fit.kind.name != "fractional_zener" and fit.kind.effective is None and not _has_spring(fit.parameters)
     sentences = [_cut_off(fit)] if endless else []
-    if made.error > as_prony_modes.ALLOWED:
+    error = fit.details["conversion"]["largest_relative_error"]
+    if error > as_prony_modes.ALLOWED:
         sentences.append(
             f"{fit.modes} Prony modes represent the model {fit.kind.name} only with errors of up to "
-            f"{100 * made.error:.2g} %: simulate a narrower band with --max-frequency"
+            f"{100 * error:.2g} %: simulate a narrower band with --max-frequency"
         )
-    sentences += limits.limit_sentences(fit.kind.name, fit.uncertainty, fit.model, fit.parameters)
-    warnings = (*fit.warnings, *sentences, *undetermined(fit))
-    details = fit.details | {"conversion": {"modes": fit.modes, "largest_relative_error": made.error}}
-    return fit._replace(details=details, warnings=warnings)
+    return sentences + limits.limit_sentences(fit.kind.name, fit.uncertainty, fit.model, fit.parameters)
 
 
 def _has_spring(own: Estimate | None) -> bool:
@@ -253,14 +258,38 @@ def choose(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) -> Fit:
         dense: result of `generalised_maxwell.spectrum(sweep)`.
     """
     tried = every_model(sweep, model, prony, dense)
-    chosen, able = best_of_models(tried, sweep)
+    return _with_rivals(best_of_models(tried, sweep)[0], tried, sweep)._replace(
+        run_time=sum(fit.run_time for fit in tried), compile_time=sum(fit.compile_time for fit in tried)
+    )
+
+
+def _with_rivals(chosen: Fit, tried: list[Fit], sweep: Sweep) -> Fit:
+    """Return the chosen fit with the other models: their table, their fits (`rivals`) and the warnings about them."""
+    able = best_of_models(tried, sweep)[1]
     return chosen._replace(
         warnings=(*chosen.warnings, *_rival_models(chosen, tried, able)),
-        run_time=sum(fit.run_time for fit in tried),
-        compile_time=sum(fit.compile_time for fit in tried),
-        details=chosen.details | {"models_compared": _compared(sweep, tried)},
+        details=chosen.details | {TABLE_OF_MODELS: _compared(sweep, tried)},
         rivals=tuple(fit for fit in able if fit is not chosen),
     )
+
+
+def compared_again(chosen: Fit, sweep: Sweep, at_rest: Callable[[Fit], Fit]) -> Fit:
+    """Return the fit of free Prony modes with the other models, which are fitted again to a corrected sweep. Nothing is
+    fitted if the fit was not compared with other models before.
+
+    Args:
+        chosen: fit to the corrected sweep, with the table of the models that were fitted to the sweep before.
+        sweep: the corrected sweep.
+        at_rest: function that returns a fit with the parameters of the sample at rest, as `chosen` has them.
+    """
+    if TABLE_OF_MODELS not in chosen.details:
+        return chosen
+    dense, prony, fluids = generalised_maxwell.spectrum(sweep), chosen, viscoelastic.FLUID.name
+    if chosen.kind.name == fluids:
+        modes = next(row["modes"] for row in chosen.details[TABLE_OF_MODELS] if row["model"] == "prony")
+        prony = viscoelastic.closed_form(sweep, modes, dense)
+    others = [fit for fit in every_model(sweep, "auto", prony, dense) if fit.kind.name != chosen.kind.name]
+    return _with_rivals(chosen, [*(at_rest(fit) for fit in others), chosen], sweep)
 
 
 def _compared(sweep: Sweep, tried: list[Fit]) -> list[Content]:
@@ -285,7 +314,8 @@ def _rival_models(chosen: Fit, tried: list[Fit], able: list[Fit]) -> list[str]:
     """Return warnings in two cases: another model fits the data about equally well, or another model fits better but
     the data do not determine all its parameters."""
     best, out = min(tried, key=information_criterion), []
-    if information_criterion(best) < information_criterion(chosen) - STRONG:
+    free = not any(best is fit for fit in able)
+    if free and information_criterion(best) < information_criterion(chosen) - STRONG:
         apart = information_criterion(chosen) - information_criterion(best)
         out.append(
             f"{best.kind.name} would fit the data more closely (criterion {apart:.2g} lower), but the data do not "
@@ -298,18 +328,24 @@ def _rival_models(chosen: Fit, tried: list[Fit], able: list[Fit]) -> list[str]:
     apart = information_criterion(second) - information_criterion(chosen)
     if apart >= STRONG:
         return out
+    if apart <= -STRONG:  # only if the data were corrected for an error that was fitted with the chosen model
+        return [
+            *out,
+            f"{second.kind.name} explains the corrected data better than {chosen.kind.name} (criterion {-apart:.2g} "
+            "lower; 10 is strong evidence), and their moduli may differ much outside the measured band",
+        ]
     return [
         *out,
-        f"{second.kind.name} explains the data about as well as {chosen.kind.name} (criterion {apart:.2g} higher; 10 "
-        "is strong evidence). The data do not decide between these models, and their moduli may differ much outside "
-        "the measured band",
+        f"{second.kind.name} explains the data about as well as {chosen.kind.name} (criterion {abs(apart):.2g} "
+        f"{'higher' if apart >= 0 else 'lower'}; 10 is strong evidence). The data do not decide between these models, "
+        "and their moduli may differ much outside the measured band",
     ]
 
 
 def comparison(fit: Fit) -> list[str]:
     """Return lines of text with the information criterion of each model, best model first. The list is empty if only
     one model was fitted."""
-    rows = fit.details.get("models_compared", [])
+    rows = fit.details.get(TABLE_OF_MODELS, [])
     if len(rows) < 2:
         return []
     lines = [f"{'model':24s} {'parameters':>10s} {'criterion':>10s} {'mean error':>11s}"]

@@ -192,7 +192,7 @@ def spectrum_in_time(test: TimeTest, near: Maxwell) -> TimeFit:
     _, answer, scales = together.reported_numbers(test)
     where = (test.time[time_tests.thinned(test)], answer, found.r * scales + answer, scales)
     own = (fit.kind, fit.model, fit.solution, fit.spread, found.converged)
-    return TimeFit(*own, *where, fit.sentences, 0.0, 0.0, fit.details, fit.own)
+    return TimeFit(*own, *where, fit.sentences, 0.0, 0.0, fit.details, fit.own, test.rounding)
 
 
 def spectrum_together(tests: list[Measured], near: Maxwell, noise: np.ndarray) -> Together:

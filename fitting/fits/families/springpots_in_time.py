@@ -173,7 +173,8 @@ def fractional_in_time(test: TimeTest, near: Maxwell) -> list[TimeFit]:
         where = (test.time[time_tests.thinned(test)], answer, fitted, scales)
         details = {"conversion": {"modes": len(found.model.ratios), "largest_relative_error": found.error}}
         own = (found.kind, found.model, found.solution, found.spread, bool(found.solution.converged))
-        out.append(TimeFit(*own, *where, found.sentences, perf_counter() - begin, 0.0, details, found.own))
+        seconds = perf_counter() - begin
+        out.append(TimeFit(*own, *where, found.sentences, seconds, 0.0, details, found.own, test.rounding))
     return out
 
 

@@ -9,7 +9,7 @@ from fitting.fits.time_tests import TimeFit
 from fitting.fits.viscoelastic import FLUID, Fit
 from fitting.methods import uncertainty
 from fitting.methods.estimate import with_slope
-from fitting.methods.noise.uneven_noise import grouped_sizes
+from fitting.methods.noise.uneven_noise import sizes_shown
 from fitting.readers import frequency_sweep
 from fitting.readers.rheometer import Sweep
 
@@ -80,7 +80,7 @@ def _noise_of_residuals(fit: Fit, sweep: Sweep, J: np.ndarray) -> np.ndarray:
     """Return the standard deviations (2n,) of the noise of G' and G'' at n frequencies, divided by the scales of the
     residuals. Residuals that are smooth from point to point are not counted as noise."""
     r, n = np.asarray(fit.solution.residuals)[: len(J)], len(J) // 2
-    own = None if fit.kind.effective is not None else grouped_sizes(J, r, np.arange(2 * n) >= n)
+    own = None if fit.kind.effective is not None else sizes_shown(J, r, np.concatenate(sweep.deviations))
     sizes = np.full(2 * n, fit.uncertainty.noise) if own is None else own
     # The scatter of few points, or of points with repeated frequencies, cannot be estimated.
     if len(np.unique(sweep.angular_frequency)) < max(n, ENOUGH):

@@ -2,7 +2,6 @@
 grows with the stress."""
 
 import numpy as np
-import scipy.linalg
 import scipy.special
 
 #: For noise proportional to a size: lower bound of the noise, divided by the largest noise.
@@ -45,44 +44,66 @@ def growing_root(J: np.ndarray, r: np.ndarray, size: np.ndarray, slope: np.ndarr
 def probability_of_sizes(J: np.ndarray, r: np.ndarray, size: np.ndarray) -> tuple[float, float]:
     """Return the logarithm of the restricted likelihood of independent noise with standard deviations proportional to
     `size` (n,), and the most probable factor of proportionality."""
-    beside = scipy.linalg.null_space(J.T)
-    try:
-        L = np.linalg.cholesky(beside.T @ (size[:, None] ** 2 * beside))
-    except np.linalg.LinAlgError:
+    U, values, _ = np.linalg.svd(J, full_matrices=False)
+    U = U[:, values > max(J.shape) * np.finfo(float).eps * values.max(initial=0.0)] / size[:, None]
+    Q, R = np.linalg.qr(U)
+    left, diagonal = r / size - Q @ (Q.T @ (r / size)), np.abs(np.diagonal(R))
+    freedom = len(r) - len(R)
+    if freedom < 1 or not (np.all(np.isfinite(left)) and np.all(diagonal > 0)):
         return -np.inf, 1.0
-    level = float(np.sqrt(np.mean(scipy.linalg.solve_triangular(L, beside.T @ r, lower=True) ** 2)))
-    return -float(np.sum(np.log(np.diagonal(L)))) - len(L) * np.log(max(level, 1e-300)), level
+    level = float(np.linalg.norm(left) / np.sqrt(freedom))
+    return -float(np.sum(np.log(size)) + np.sum(np.log(diagonal))) - freedom * np.log(max(level, 1e-300)), level
 
 
 #: The noise of two groups of residuals counts as different in size if equal noise would give such a difference with a
 #: probability below _CHANCE. The test is made only if the smallest singular value of the scaled Jacobian, divided by
 #: the largest one, is at least _CONDITION.
 _CHANCE, _CONDITION = 1e-3, 1e-8
+#: Noise with one size in Pa is assumed only if its log-likelihood exceeds that of relative noise by this value.
+_LIKELIER = 5.0
 
 
-def grouped_root(J: np.ndarray, r: np.ndarray, second: np.ndarray, slope: np.ndarray) -> np.ndarray | None:
-    """Return the square root (P, n) of the covariance of P parameters if two groups of residuals have noise of
-    different size. Returns None if `grouped_sizes` returns None.
+def root_of_sizes(J: np.ndarray, sizes: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Return the square root (P, n) of the covariance of P parameters for residuals with standard deviations `sizes`
+    (n,). `J`, `slope`: see `uneven_root`."""
+    scale = np.linalg.norm(J, axis=0)
+    return slope @ (np.linalg.pinv(J / scale) / scale[:, None] * sizes)
+
+
+def sizes_shown(J: np.ndarray, r: np.ndarray, scales: np.ndarray) -> np.ndarray | None:
+    """Return the standard deviations (2m,) of the residuals of m values of G' and of m values of G'', if the residuals
+    show that these differ. Returns None if they may be equal.
+
+    There are two alternatives to equal noise. G' and G'' may have relative noise of different size (`grouped_sizes`).
+    Or the noise of all values may have one size in Pa, for example because of the resolution of the torque.
 
     Args:
-        J, r, slope: see `uneven_root`.
-        second: whether each residual (n,) belongs to the second group.
+        J, r: see `uneven_root`.
+        scales: divisors (2m,) of the residuals [Pa].
     """
-    sizes, scale = grouped_sizes(J, r, second), np.linalg.norm(J, axis=0)
-    return None if sizes is None else slope @ (np.linalg.pinv(J / scale) / scale[:, None] * sizes)
+    if not _determined(J) or len(r) <= J.shape[1] + 1:
+        return None
+    grouped = grouped_sizes(J, r, np.arange(len(r)) >= len(r) // 2)
+    constant = np.median(scales) / scales
+    others = [np.ones(len(r))] + ([] if grouped is None else [grouped])
+    best, level = probability_of_sizes(J, r, constant)
+    if best > max(probability_of_sizes(J, r, own)[0] for own in others) + _LIKELIER:
+        return level * constant
+    return grouped
 
 
 def grouped_sizes(J: np.ndarray, r: np.ndarray, second: np.ndarray) -> np.ndarray | None:
     """Return the standard deviation of each residual (n,) if two groups of residuals (for example of G' and G'') have
     noise of different size. Returns None if the difference may be random, or if the data hardly determine some
-    combination of the unknowns. Arguments: see `grouped_root`.
+    combination of the unknowns.
+
+    Args:
+        J, r: see `uneven_root`.
+        second: whether each residual (n,) belongs to the second group.
     """
+    if not _determined(J):
+        return None
     scale = np.linalg.norm(J, axis=0)
-    if not (np.all(np.isfinite(J)) and np.all(scale > 0)):
-        return None
-    values = np.linalg.svd(J / scale, compute_uv=False)
-    if values[-1] < _CONDITION * values[0]:
-        return None
     leverage = np.einsum("kn,nk->n", np.linalg.pinv(J / scale), J / scale)
     freedom, square = (np.array([v[~second].sum(), v[second].sum()]) for v in (1 - leverage, r**2))
     if not (np.all(freedom > 1) and np.all(square > 0)):
@@ -93,3 +114,12 @@ def grouped_sizes(J: np.ndarray, r: np.ndarray, second: np.ndarray) -> np.ndarra
     if large == small or 2 * chance > _CHANCE:
         return None
     return np.sqrt(variance)[second.astype(int)]
+
+
+def _determined(J: np.ndarray) -> bool:
+    """Return whether residuals with the derivatives J (n, p) determine all combinations of the p unknowns."""
+    scale = np.linalg.norm(J, axis=0)
+    if not (np.all(np.isfinite(J)) and np.all(scale > 0)):
+        return False
+    values = np.linalg.svd(J / scale, compute_uv=False)
+    return bool(values[-1] >= _CONDITION * values[0])
