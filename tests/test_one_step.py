@@ -1,5 +1,7 @@
 """One linear solve per step, the chapter's scheme: `newton = "one_step"`."""
 
+from types import SimpleNamespace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,6 +10,8 @@ import scipy.sparse.linalg
 import liverjax as lj
 from liverjax.core import status
 from liverjax.core.struct import replace
+from liverjax.jobs.sweep import _failures
+from liverjax.physics.elastic_support import ElasticSupport
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -77,3 +81,22 @@ def test_one_step_of_newton_takes_the_regularised_stiffness():
     assert np.abs(np.asarray(found) - expected).max() < 1e-7 * np.abs(expected - x).max()
     plain = lj.simulate(replace(scene, solve=replace(scene.solve, robust="off")), start=jnp.array(x)).positions[0]
     assert np.abs(np.asarray(plain) - expected).max() > 1e-3 * np.abs(expected - x).max()
+
+
+def test_a_sweep_reports_a_failure_rather_than_one_step():
+    """The code of one step is the largest code, so it hid steps that were not finite."""
+    rows = SimpleNamespace(numbers=np.array([3, 5, 7]))
+    codes = np.array([[8, 2, 8], [0, 8, 0], [0, 0, 0]])
+    assert _failures(rows, codes) == {3: status.NOT_FINITE, 5: status.ONE_STEP}
+
+
+def test_a_dynamic_step_of_one_solve_has_the_loads_and_motions_at_its_end():
+    """They acted one step late. The motions are small, so one solve is exact."""
+    scene, times = hanging(kind="dynamic", dt=0.01, steps=2, newton="one_step"), jnp.array([0.0, 0.02])
+    side = lj.boundary.boundary_triangles(scene.mesh, scene.mesh.node_sets["x_max"])
+    wall = ElasticSupport(triangles=side, normal=1e4, times=times, history=jnp.array([[0.0, 0, 0], [1e-7, 0, 0]]))
+    pull = lj.Traction(triangles=side, value=jnp.array([0.0, 1e-3, 0.0]), times=times, history=jnp.array([0.0, 1.0]))
+    still = replace(scene.body, gravity=jnp.zeros(3))
+    run = lj.simulate(replace(scene, body=still, physics=(wall,), traction=(pull,)))
+    assert np.all(np.abs(np.asarray(run.positions[0] - scene.mesh.points)).max(axis=0)[:2] > 1e-9)
+    assert np.asarray(run.statistics.residual).max() < 1e-3

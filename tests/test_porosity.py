@@ -8,6 +8,7 @@ import pytest
 import liverjax as lj
 from liverjax.core.struct import in_precision, replace
 from liverjax.physics import darcy, porosity
+from liverjax.physics.base import Step
 from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene_file import scene_from
 from liverjax.simulation.cautions import cautions_of_run, of_drained_layer
@@ -383,3 +384,18 @@ def test_a_pressure_that_overshoots_beside_the_drained_face_is_told(part, told):
     if told:
         advised = float(said.split("use a dt of ")[1].split(" s")[0])
         assert advised == pytest.approx(0.4 * (HEIGHT / layers) ** 2 / (2e-5 * M), rel=0.06)
+
+
+@pytest.mark.parametrize("inertia", [False, True])
+def test_the_first_pressure_equation_of_a_run_that_begins_at_other_positions(inertia):
+    """A static run took the flow at its first guess. A dynamic run took the volumes of the reference shape."""
+    rest, pressed = (lj.shapes.box((0.02, 0.02, height), (1, 1, 2)) for height in (HEIGHT, 0.8 * HEIGHT))
+
+    def equation(mesh: lj.TetMesh, x: jax.Array) -> darcy.Flow:
+        step = Step(mesh, x, 1, 1, 1e3, inertia, 1e-8, None)
+        return SPONGE.freeze(porosity.initial_fluid(SPONGE, mesh), step).flow
+
+    found, at = equation(rest, pressed.points), pressed if inertia else rest
+    expected = equation(at, at.points)
+    assert np.allclose(found.store, expected.store, rtol=1e-12)
+    assert np.allclose(found.matrix.rows[0][0], expected.matrix.rows[0][0], rtol=1e-9, atol=1e-20)

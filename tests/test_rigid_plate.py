@@ -12,12 +12,14 @@ import liverjax as lj
 from fitting.rigs import torsion
 from fitting.rigs.torsion import Drive
 from liverjax.core import bounds
+from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
 from liverjax.mesh.cylinders import graded_cylinder
 from liverjax.mesh.nodal import nodal_volumes
 from liverjax.physics.base import Step
 from liverjax.physics.rigid_plate import RigidPlate
 from liverjax.physics.sliding_support import SlidingSupport
+from liverjax.scenes.checks.rigid_motion import check_held
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -305,3 +307,20 @@ def test_the_mesh_error_of_a_plate_on_quadratic_elements(by):
     value, change = result.mesh_error.change(result_of, result)
     assert bool(result.mesh_error.found.all())
     assert 0.5 < change / (FINE[by] - value) < 2
+
+
+@pytest.mark.parametrize(("by", "lifts"), [("angle", False), ("angle", True), ("torque", False), ("torque", True)])
+def test_a_plate_prevents_every_rigid_motion_that_it_cannot_do_itself(by, lifts):
+    """A body that was held completely by a plate was refused, because the tilts of the plate counted as free."""
+    mesh = lj.shapes.box((0.1, 0.1, 0.1), (1, 1, 1))
+    top = mesh.node_sets["z_max"]
+    plate = RigidPlate(nodes=top, turn=0.0, by=by, lifts=lifts, centre=(0.05, 0.05, 0.0))
+    scene = lj.Scene(mesh=mesh, law=lj.laws.NeoHookean(mu=1.0, bulk=3.0), physics=(plate,))
+    below = mesh.node_sets["z_min"][:1]
+    for axes in ("", "x", "z", "xz"):
+        own = replace(scene, fixed=(lj.Fixed(nodes=below, axes=axes),) if axes else ())
+        if (by == "angle" or "x" in axes) and (not lifts or "z" in axes):
+            check_held(own)
+        else:
+            with pytest.raises(InputError, match="do not prevent every rigid motion"):
+                check_held(own)

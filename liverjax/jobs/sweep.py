@@ -302,13 +302,15 @@ def _joined(sweep: Sweep, out: Path, folder: Path, computed: int) -> Done:
     files = [resumable_parts.part(folder, k) for k in _chunks(sweep)]
     try:
         with resumable_parts.locked(folder / "lock_join"):
-            if out.exists():
-                return _already(sweep, out, True)._replace(computed=computed)
-            if not all(f.exists() for f in files):
+            there = out.exists()
+            if not there and not all(f.exists() for f in files):
                 return Done(None, {}, computed, {})
-            codes, J = _join(sweep, out, files)
+            if not there:
+                codes, J = _join(sweep, out, files)
     except (InputError, FileNotFoundError):  # another process is joining the parts
         return Done(None, {}, computed, {})
+    if there:
+        return _already(sweep, out, True)._replace(computed=computed)
     resumable_parts.remove(folder)
     return Done(out, _failures(sweep, codes), computed, _crushed(sweep, codes, J))
 
@@ -347,7 +349,11 @@ def _join(sweep: Sweep, out: Path, files: list[Path]) -> tuple[np.ndarray, np.nd
 
 
 def _failures(sweep: Sweep, codes: np.ndarray) -> dict[int, int]:
-    worst = np.where(codes != status.CONVERGED, codes, 0).max(axis=1)
+    """Return {row number: code} of the runs that failed. If a run has failures and `ONE_STEP`, the failure is
+    returned."""
+    above = codes == status.ONE_STEP
+    worst = np.where(above, status.CONVERGED, codes).max(axis=1)
+    worst = np.where((worst == status.CONVERGED) & above.any(axis=1), status.ONE_STEP, worst)
     return {int(sweep.numbers[k]): int(worst[k]) for k in np.flatnonzero(worst != status.CONVERGED)}
 
 

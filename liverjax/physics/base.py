@@ -381,7 +381,11 @@ class Physics:
         return None
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Return n node numbers (n,) and the directions (n, 3) in which this physics constrains these nodes."""
+        """Return n node numbers (n,) and the directions (n, 3) in which this physics constrains these nodes.
+
+        If each of n constraints contains m nodes, the shapes are (n, m) and (n, m, 3). Then the sum of the m
+        displacements along their directions is constrained.
+        """
         return np.zeros(0, int), np.zeros((0, 3))
 
     def pulls_single_nodes(self) -> bool:

@@ -90,14 +90,17 @@ class Porosity(Physics):
 
         In the lagged scheme, this equation does not depend on the end of the step, so it is solved here.
         """
-        F = deformation_gradient(step.mesh, step.x)
-        found = darcy.flow(self, step.mesh, memory.J, F, step.dt, 1e-2 * step.tolerance)
+        # In a static run the first positions are only a guess, so the first step begins at the reference shape.
+        x = step.x if step.inertia else jnp.where(step.k == 1, step.mesh.points, step.x)
+        F = deformation_gradient(step.mesh, x)
+        J = determinant(F)  # if a run begins at other positions, `memory.J` is still 1 there
+        found = darcy.flow(self, step.mesh, J, F, step.dt, 1e-2 * step.tolerance)
         if self.inlet:
             given, enters = inflow(self, step.mesh, step.k * step.dt, step.dt)
             found = found._replace(given=given, enters=enters)
         if self.scheme == "implicit":
             return CoupledSponge(porosity=self, fluid=memory, flow=found)
-        return LaggedSponge(porosity=self, fluid=memory, given=pressure(self, step.mesh, memory, found, determinant(F)))
+        return LaggedSponge(porosity=self, fluid=memory, given=pressure(self, step.mesh, memory, found, J))
 
     def advance(self, memory: "Fluid", acting: "Sponge", end: End) -> "Fluid":
         """Return the state of the fluid at the end of the step: pressures and volume ratios."""

@@ -99,19 +99,21 @@ class RigidPlate(Physics):
         return free if self.still is None else free._replace(mask=free.mask.at[self.still].set(0.0))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Return nodes (n,) and the directions (n, 3) in which the plate constrains them.
+        """Return pairs of nodes (n, 2) and their directions (n, 2, 3), for n constraints of the plate.
 
-        Two directions are perpendicular to the axis. If `lifts` is false, the direction of the axis is added. If the
-        angle is given, the direction of the rotation is added.
+        Each node of the plate is fixed towards the axis, around it and along it. If the plate itself can move in this
+        way, only the difference to the node farthest from the axis is fixed.
         """
         nodes, arms = np.asarray(self.nodes), np.asarray(self.at_rest(mesh).arms(mesh.points))
-        across = np.linalg.svd(np.asarray(self.axis)[None], full_matrices=True)[2][1:]
-        first = [nodes[:1], nodes[:1]] + ([] if self.lifts else [nodes[:1]])
-        rows = [*across] + ([] if self.lifts else [np.asarray(self.axis)])
-        if self.by == "angle":
-            far = int(np.argmax(np.linalg.norm(arms, axis=1)))
-            first, rows = [*first, nodes[far : far + 1]], [*rows, arms[far] / np.linalg.norm(arms[far])]
-        return np.concatenate(first), np.stack(rows)
+        radii, axis = np.linalg.norm(arms, axis=1), np.broadcast_to(np.asarray(self.axis, arms.dtype), arms.shape)
+        far = int(np.argmax(radii))
+        some, ratio = arms[far] / radii[far], (radii / radii[far])[:, None]
+        # On the axis, all directions around it are equally good.
+        around = np.where(ratio > 1e-9, arms / np.maximum(radii, 1e-300)[:, None], some)
+        free = (0 * arms, ratio * some * (self.by == "torque"), axis * self.lifts)  # motions of the farthest node
+        own = (np.cross(around, axis), around, axis)
+        both = [np.stack([nodes, np.where(b.any(axis=1), nodes[far], nodes)], axis=1) for b in free]
+        return np.concatenate(both), np.stack([np.concatenate(own), -np.concatenate(free)], axis=1)
 
 
 class Plate(NamedTuple):

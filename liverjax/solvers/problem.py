@@ -96,7 +96,8 @@ class Problem(NamedTuple):
     adjoint: Callable[[Any, jax.Array, Number, int, Earlier], tuple[jax.Array, jax.Array, jax.Array]] | None = None
     #: Whether dr/dq and its preconditioner are symmetric.
     symmetric: bool = True
-    #: Whether r may depend on s.
+    #: Whether a substep of Newton's method begins with the term dr/ds. With only one linear solve, this term is always
+    #: used.
     moved: bool = True
     #: Norm of the change of r that the rounding of q causes.
     roundoff: Any = 0.0

@@ -239,7 +239,7 @@ def _one_step(problem: Problem, start: jax.Array, kept: Kept, options: StepOptio
         problem = problem._replace(tangent=problem.potential.definite)
     zero, one = jnp.zeros((), start.dtype), jnp.ones((), start.dtype)
     r, _, by = problem.residual(start, zero)
-    load = -r - _along(problem, start, zero) if problem.moved else -r
+    load = -r - _along(problem, start, zero)  # the loads and motions at the end of the step
     at = (start, zero, by)
     finest = 16 * float(jnp.finfo(start.dtype).eps)
     wanted = jnp.clip(0.3 * options.tolerance, finest, _ONE_STEP)

@@ -56,8 +56,8 @@ def loose_piece(scene: Scene, holds: Callable[[Physics], tuple[np.ndarray, np.nd
 
     Args:
         scene: `Scene`.
-        holds: function of an object in `scene.physics`. It returns n node numbers (n,) and the directions (n, 3) in
-            which the object fixes these nodes.
+        holds: function of an object in `scene.physics`. It returns the nodes and directions of constraints, as
+            `Physics.holds` does.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -67,25 +67,29 @@ def loose_piece(scene: Scene, holds: Callable[[Physics], tuple[np.ndarray, np.nd
     pieces, label = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), shape=(n, n)), directed=False)
     fixed = np.argwhere(~free_places(scene.mesh, scene.fixed, scene.displaced))
     both = [(fixed[:, 0], np.eye(3)[fixed[:, 1]]), *(holds(physics) for physics in scene.physics)]
-    numbers, directions = (np.concatenate(a) for a in zip(*both, strict=True))
+    points = np.asarray(scene.mesh.points)
     for piece in range(pieces):
-        nodes = np.flatnonzero(label == piece)
-        inside = np.isin(numbers, nodes)
-        points = np.asarray(scene.mesh.points)
-        held = points[numbers[inside]] - points[nodes].mean(axis=0)
-        if _rigid_rank(held, directions[inside], np.ptp(points[nodes], axis=0).max()) < 6:
-            return f"piece {piece} ({len(nodes)} nodes)" if pieces > 1 else "the body"
+        inside = label == piece
+        size = np.ptp(points[inside], axis=0).max()
+        arms = (points - points[inside].mean(axis=0)) / max(size, 1e-300)
+        rows = np.concatenate([_rigid_motions(*one, arms, inside) for one in both])
+        if not len(rows) or np.linalg.matrix_rank(rows, tol=1e-6) < 6:
+            return f"piece {piece} ({inside.sum()} nodes)" if pieces > 1 else "the body"
     return ""
 
 
-def _rigid_rank(points: np.ndarray, directions: np.ndarray, size: float) -> int:
-    """Return the rank of the six rigid motions of a body, projected on n fixed directions (n, 3) at points (n, 3).
+def _rigid_motions(numbers: np.ndarray, directions: np.ndarray, arms: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """Return the six rigid motions of a piece, projected on the n constraints (n, 6) that concern only this piece.
 
-    The rank is 6 if the fixed directions prevent all rigid motions. `size`: largest dimension of the body [m].
+    Args:
+        numbers: node numbers (N,) or (N, m) of all constraints.
+        directions: directions (N, 3) or (N, m, 3) of these nodes.
+        arms: positions (V, 3) of all nodes from the middle of the piece, divided by its size.
+        inside: whether a node belongs to the piece (V,).
     """
-    if not len(points):
-        return 0
+    if numbers.ndim == 1:
+        numbers, directions = numbers[:, None], directions[:, None]
     # A rotation about an axis e moves a point x by cross(e, x). The component of this motion along a direction d is
     # cross(x, d) . e.
-    motions = np.concatenate([directions, np.cross(points / max(size, 1e-300), directions)], axis=1)
-    return int(np.linalg.matrix_rank(motions, tol=1e-6))
+    motions = np.concatenate([directions, np.cross(arms[numbers], directions)], axis=2).sum(axis=1)
+    return motions[inside[numbers].all(axis=1)]
