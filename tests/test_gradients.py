@@ -226,6 +226,21 @@ def test_a_step_keeps_no_more_than_its_state_and_root():
     assert abs(predicted / sizes[1] - 1) < 0.2
 
 
+def test_the_predicted_memory_is_that_of_the_prepared_scene():
+    """In single precision, twice the memory was predicted. For quadratic elements, the pressures were missing."""
+    mesh = lj.quadratic(lj.shapes.box((0.02, 0.02, 0.02), (1, 1, 1)))
+    law = lj.laws.NeoHookean(mu=770.0, bulk=77000.0)
+
+    def predicted(steps, **changes):
+        solve = lj.Solve(steps=steps, volumetric="auto", **changes)
+        return gradients.memory(lj.Scene(mesh=mesh, law=law, solve=solve))
+
+    one, two = predicted(1), predicted(2)
+    assert predicted(1, precision="float32") == pytest.approx(one / 2, rel=1e-2)
+    # State and root contain positions and pressures of vertices.
+    assert two - one == 2 * 8 * (3 * mesh.number_of_nodes + mesh.number_of_vertices)
+
+
 @pytest.mark.slow
 def test_codes_of_derivatives():
     """The derivative is computed through a step that did not converge, and where the adjoint solve fails. Both use one

@@ -1,5 +1,9 @@
 """The state of rest about which a body oscillates: which loads act there, and which are amplitudes only."""
 
+from types import SimpleNamespace
+
+import h5py
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,10 +12,16 @@ from test_porosity import column
 import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.core.struct import replace
-from liverjax.jobs import waves
+from liverjax.jobs import output, waves
+from liverjax.mesh.tetrahedra import with_points
 from liverjax.physics.porosity import Inlet
 from liverjax.scenes.scene_file import scene_from
-from liverjax.simulation.unloaded import cautions_of_loaded
+from liverjax.scenes.springpots import springpot_factors
+from liverjax.simulation.equations import forces_at
+from liverjax.simulation.run import prepared
+from liverjax.simulation.unloaded import cautions_of_loaded, resting
+from liverjax.waves import rest
+from liverjax.waves.harmonic import _small
 from liverjax.waves.rest import under_its_weight
 
 pytestmark = pytest.mark.quick_to_compile
@@ -128,3 +138,87 @@ traction = [{where = {x_min = 0.02}, value = [100.0, 0.0, 0.0]}]
     assert waves._of_rest(scene, x, 0.9 * reactions, "--about run")
     unknown = np.where(reactions == 0, 0.0, np.nan)
     assert "was not checked, because a traction of that run" in waves._of_rest(scene, x, unknown, "--about run")[0]
+
+
+def test_a_run_with_another_reference_shape_is_refused(tmp_path):
+    """The mesh of the run was loaded. Only the number of nodes was compared, so its stress was lost without a word."""
+    table = {
+        "mesh": {"shape": "box", "size": [0.02, 0.02, 0.04], "cells": [1, 1, 2]},
+        "law": {"name": "neo_hookean", "mu": 500.0, "bulk": 5000.0},
+        "solve": {"kind": "harmonic", "frequencies": [3.0]},
+    }
+    given = scene_from(table)
+    x = np.asarray(given.mesh.points)
+    run = replace(given, mesh=with_points(given.mesh, x * [1.0, 1.0, 0.97]))
+    steps = SimpleNamespace(times=[1.0], positions=x[None], reactions=np.zeros((1, *x.shape)), pressure=None)
+    with h5py.File(tmp_path / "result.h5", "w") as file:
+        file["positions"], file["reactions"], file["reference"] = steps.positions, steps.reactions, run.mesh.points
+        file.attrs["status"] = [0]
+    with pytest.raises(
+        lj.InputError,
+        match=r"another reference shape than the scene \(nodes differ by up to 0.0012 m.* Select nodes with where",
+    ):
+        waves._last_state(tmp_path / "result.h5", given)
+    output.write_vtu(tmp_path / "vtu", run, steps)
+    unloaded = scene_from(table | {"mesh": {"file": "vtu/step_00001.vtu"}}, tmp_path)
+    assert np.array_equal(waves._last_state(tmp_path / "result.h5", unloaded)[0], x)
+    assert not unloaded.mesh.node_sets and not unloaded.mesh.element_sets
+
+
+@pytest.mark.parametrize("limits", [None, np.array([4.0, 4.0])])
+def test_a_springpot_with_exponent_0_is_a_spring_at_rest(limits):
+    """Only the spring counted at rest, so the sag was too large, and spring = 0 was refused. The stiffness at rest is
+    that at frequency 0."""
+    mesh, law = lj.shapes.box((0.02, 0.02, 0.02), (1, 1, 1)), lj.laws.NeoHookean(mu=2000.0, bulk=20000.0)
+    for spring in (0.0, 0.5):
+        own = lj.SpringpotSeries(times=[1.0, 1.0], exponents=jnp.array([0.0, 0.5]), limits=limits, spring=spring)
+        scene = lj.Scene(mesh=mesh, law=law, springpots=own)
+        rest._check_spring(scene)
+        factor = spring + (1.0 if limits is None else 0.8)
+        np.testing.assert_allclose(resting(scene).law.mu, factor * 2000.0, rtol=1e-12)
+        np.testing.assert_allclose(springpot_factors(own, jnp.array([1e-14])), factor, atol=1e-6)
+
+
+def test_a_springpot_without_spring_is_refused_inside_jit_too():
+    """The stiffness at rest was computed with jnp. Inside jit it was a tracer, so it was not checked."""
+    mesh = lj.shapes.box((0.02, 0.02, 0.02), (1, 1, 1))
+
+    def check(mu, exponents):
+        own = lj.SpringpotSeries(times=[1.0], exponents=exponents, spring=0.0)
+        rest._check_spring(lj.Scene(mesh=mesh, law=lj.laws.NeoHookean(mu=mu, bulk=20000.0), springpots=own))
+        return mu
+
+    with pytest.raises(lj.InputError, match=r"springpots.spring = 0 leaves no shear stiffness at rest"):
+        jax.jit(lambda mu: check(mu, np.array([0.5])))(2000.0)
+    jax.jit(lambda mu: check(mu, np.array([0.0])))(2000.0)  # a spring
+    jax.jit(check)(2000.0, jnp.array([0.5]))  # an unknown exponent may be 0
+
+
+def _quadratic_body(part: str) -> lj.Scene:
+    """A viscous body with volumetric = "auto". For part = "all", this means "element"."""
+    return lj.Scene(
+        mesh=lj.quadratic(lj.shapes.box((0.02, 0.02, 0.02), (1, 1, 1))),
+        law=lj.laws.NeoHookean(mu=770.0, bulk=77000.0),
+        viscosity=lj.Prony(ratios=jnp.array([0.3]), relaxation_times=jnp.array([0.1]), part=part),
+        solve=lj.Solve(kind="harmonic", frequencies=jnp.array([5.0]), volumetric="auto"),
+    )
+
+
+@pytest.mark.parametrize(("part", "form"), [("all", "element"), ("isochoric", "mixed")])
+def test_rest_has_the_form_of_volumes_of_the_motion(part, form):
+    """The form of "auto" was chosen again for rest, without viscosity. With gravity, the motion was wrong by 103 %."""
+    viscous = _quadratic_body(part)
+    springpots = lj.SpringpotSeries(times=jnp.array([0.1]), exponents=jnp.array([0.3]), spring=0.5, part=part)
+    soft = replace(viscous, viscosity=None, springpots=springpots)
+    for scene in (viscous, soft, replace(soft, solve=lj.Solve(volumetric="auto"))):
+        assert _small(scene, "consistent").solve.volumetric == resting(scene).solve.volumetric == form
+
+
+def test_forces_of_a_relaxed_body_have_the_form_of_volumes_of_the_run():
+    """The forces of the run were compared with those of another form, and said not to be relaxed."""
+    scene = _quadratic_body("all")
+    x = scene.mesh.points * jnp.array([[1.0, 1.0, 1.1]]) + 3.0 * scene.mesh.points[:, :1] ** 2
+    relaxed = lj.laws.NeoHookean(mu=0.7 * 770.0, bulk=0.7 * 77000.0)
+    run = replace(scene, law=relaxed, viscosity=None, solve=lj.Solve(volumetric="element"))
+    reactions = np.array(forces_at(prepared(run), x))
+    assert waves._of_rest(scene, x, reactions, "--about run") == []

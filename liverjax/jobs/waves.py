@@ -33,6 +33,9 @@ from liverjax.waves.rest import under_its_weight
 
 #: The program warns if the reactions of the relaxed body and of the run differ by more than this fraction.
 _RESTED = 0.05
+#: Two reference shapes are equal if their nodes differ by less than this fraction of the largest coordinate. The
+#: roundoff of files in float32 is 1e-7.
+_SAME_SHAPE = 1e-6
 
 
 class Waves(NamedTuple):
@@ -49,8 +52,9 @@ def solved_waves(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
 
     Args:
         scene: `Scene`.
-        about: result.h5 of a run of the same mesh. The body vibrates about the last state of this run. If `about` is
-            None, the body vibrates about the state of rest under gravity and pre-tension, or about the reference shape.
+        about: result.h5 of a run with the same mesh and the same reference shape. The body vibrates about the last
+            state of this run. If `about` is None, the body vibrates about the state of rest under gravity and
+            pre-tension, or about the reference shape.
         mesh_error: whether to estimate the discretisation error of the mesh.
 
     Raises:
@@ -83,6 +87,7 @@ def _last_state(file: Path, scene: Scene) -> tuple[jax.Array, np.ndarray]:
     try:
         with h5py.File(file) as given:
             x, reactions = (np.asarray(given[name][-1]) for name in ("positions", "reactions"))
+            reference = np.asarray(given["reference"])
             code = int(np.ravel(read_by_step(given, "status"))[-1])
             text = str(given.attrs.get("scene", ""))
     except FileNotFoundError:
@@ -93,6 +98,14 @@ def _last_state(file: Path, scene: Scene) -> tuple[jax.Array, np.ndarray]:
         raise InputError(
             f"--about {file} has {len(x)} nodes, but the scene has {scene.mesh.number_of_nodes}: give a run of the "
             "same mesh"
+        )
+    points = np.asarray(scene.mesh.points)
+    apart = float(np.abs(reference - points).max())
+    if apart > _SAME_SHAPE * np.abs(points).max():
+        raise InputError(
+            f"--about {file} has another reference shape than the scene (nodes differ by up to {apart:.2g} m): give a "
+            'run of the same shape; if that run has a loaded mesh, repeat it with --vtu, and write file = "…" with its '
+            "file vtu/step_00001.vtu into [mesh] of the scene. Select nodes with where, since this file has no sets"
         )
     if code not in (status.CONVERGED, status.ONE_STEP):
         raise InputError(
@@ -130,7 +143,7 @@ def _of_rest(scene: Scene, x: jax.Array, reactions: np.ndarray, name: str) -> li
     # Membranes, ligaments and springs also pull at fixed nodes. Obstacles and sliding supports do not.
     pulling = tuple(own for own in scene.physics if not isinstance(own, Obstacle | SlidingSupport))
     still = resting(replace(by_element(scene), traction=(), fixed=(), displaced=(), physics=pulling))
-    still = replace(still, solve=Solve(volumetric=scene.solve.volumetric))
+    still = replace(still, solve=Solve(volumetric=still.solve.volumetric))
     relaxed = np.asarray(jax.jit(forces_at)(prepared(still), x))
     apart = float(np.linalg.norm((relaxed - reactions)[at]) / np.linalg.norm(reactions[at]))
     if apart <= _RESTED:

@@ -36,7 +36,7 @@ class SpringpotSeries:
         above=0.0,
         default=None,
     )
-    spring: Number = param("1", "stiffness at frequency 0, divided by the stiffness of the law", lower=0.0, default=1.0)
+    spring: Number = param("1", "stiffness of the spring, divided by the stiffness of the law", lower=0.0, default=1.0)
     part: str = static(
         default="all", about="all: whole stress; isochoric: only the isochoric part of the stress", words=PARTS
     )
@@ -63,7 +63,14 @@ def check_springpots(own: SpringpotSeries, law: Law, viscosity: Prony | None) ->
 
 def series_at_rest(own: SpringpotSeries) -> Prony:
     """Return a Prony series whose completely relaxed stress is equal to the stress of the springpots at rest."""
-    return Prony(ratios=1 - jnp.atleast_1d(own.spring), relaxation_times=jnp.ones(1), part=own.part)
+    return Prony(ratios=1 - jnp.atleast_1d(factor_at_rest(own)), relaxation_times=jnp.ones(1), part=own.part)
+
+
+def factor_at_rest(own: SpringpotSeries) -> jax.Array:
+    """Return the ratio G*/G0 at frequency 0: the spring, and all springpots with exponent 0, which are springs too."""
+    compliance = jnp.ones(()) if own.limits is None else 1 + 1 / jnp.atleast_1d(own.limits)
+    springs = jnp.where(jnp.atleast_1d(own.exponents) == 0, 1 / compliance, 0.0)
+    return jnp.asarray(own.spring) + jnp.sum(springs)
 
 
 def springpot_factors(own: SpringpotSeries, omegas: jax.Array) -> jax.Array:

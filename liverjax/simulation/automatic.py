@@ -17,7 +17,7 @@ import numpy as np
 from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
 from liverjax.scenes.by_element import by_element
-from liverjax.scenes.checks.choices import check_choices
+from liverjax.scenes.checks.choices import check_volumetric
 from liverjax.scenes.scene import Scene, with_parameters
 
 LARGEST, STIFFEST, THINNEST = 10_000, 1e3, 1e-3
@@ -126,7 +126,7 @@ def form_of_volumes(scene: Scene) -> str:
 def _allows_mixed(scene: Scene) -> bool:
     """Return whether `volumetric` can be "mixed" in this scene."""
     try:
-        check_choices(replace(scene, solve=replace(scene.solve, volumetric="mixed")))
+        check_volumetric(replace(scene, solve=replace(scene.solve, volumetric="mixed")))
     except InputError:
         return False
     return True

@@ -15,12 +15,12 @@ import jax.numpy as jnp
 
 from liverjax.core import status
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, struct
+from liverjax.core.struct import param, replace, struct
 from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.scenes.scene_checks import check_before_run
 from liverjax.simulation import automatic, gradient_checkpoints
-from liverjax.simulation.equations import equations, initial_state
-from liverjax.simulation.run import Result, simulate
+from liverjax.simulation.equations import equations, initial_state, unknowns
+from liverjax.simulation.run import Result, prepared, simulate
 from liverjax.simulation.step import beginning
 
 MODES = ("reverse", "forward")
@@ -99,17 +99,25 @@ _WORK = 440
 
 
 def memory(scene: Scene, store: str | int = "all") -> int:
-    """Predict the memory [bytes] for a derivative in reverse mode, without compilation."""
+    """Predict the memory [bytes] for a derivative in reverse mode, without compilation.
+
+    For a loaded mesh, the memory for the search for its reference shape is not included.
+
+    Raises:
+        InputError: `store` is unknown, or `prepared` would raise InputError.
+    """
     steps = scene.solve.steps
     kept = gradient_checkpoints.number_kept(store, steps)
 
+    # The numbers of nodes and elements do not depend on the shape, so the reference shape is not computed.
+    scene = prepared(replace(scene, points_are="reference"))
+
     def carry(scene):
         start = initial_state(scene)
-        first = equations(scene, start, jnp.ones(()))
-        return start, beginning(first)[0]
+        first = equations(scene, start, jnp.ones((), scene.mesh.points.dtype))
+        return start, beginning(first)[0], unknowns(first, start.x)
 
-    state, tangent = (_bytes(part) for part in jax.eval_shape(carry, scene))
-    root = _bytes(scene.mesh.points)
+    state, tangent, root = (_bytes(part) for part in jax.eval_shape(carry, scene))
     if scene.porosity is not None and scene.porosity.scheme == "implicit":
         root += scene.mesh.number_of_vertices * scene.mesh.points.dtype.itemsize
     # There are two tangents: the tangent of a step, and the tangent of the beginning of the run.

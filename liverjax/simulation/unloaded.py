@@ -28,7 +28,7 @@ from liverjax.physics.viscosity import lasting
 from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene import Scene, named_physics
 from liverjax.scenes.springpots import series_at_rest
-from liverjax.simulation import tangent
+from liverjax.simulation import automatic, tangent
 from liverjax.simulation.equations import Equations, Sizes, equations, force_sizes, initial_state, residual, unknowns
 from liverjax.solvers.block_matrix import columns, flat
 from liverjax.solvers.newton import NewtonOptions, newton_root
@@ -67,7 +67,12 @@ def unload(scene: Scene) -> Unloaded:
 
 
 def resting(scene: Scene) -> Scene:
-    """Return a static scene of the same body, which has fully relaxed under the loads at time 0."""
+    """Return a static scene of the same body, which has fully relaxed under the loads at time 0.
+
+    The form of the volume changes stays that of the given scene: without viscosity, `volumetric = "auto"` could choose
+    another form.
+    """
+    form = automatic.form_of_volumes(scene)
     if scene.springpots is not None:
         scene = replace(scene, viscosity=series_at_rest(scene.springpots), springpots=None)
     law = scene.law
@@ -84,6 +89,7 @@ def resting(scene: Scene) -> Scene:
     held = tuple(Fixed(nodes=d.nodes, axes=d.axes) for d in scene.displaced)
     # There is one step with dt = 0, so each history has its first value.
     solve = replace(scene.solve, kind="static", steps=1, dt=0.0, newton="converged", robust="off")
+    solve = replace(solve, volumetric=form)
     changed: Content = {"fixed": (*scene.fixed, *held), "physics": tuple(p.at_beginning() for p in scene.physics)}
     changed |= {"displaced": (), "solve": solve, "points_are": "reference"}
     return replace(scene, law=law, unrelaxed=scene.law, viscosity=None, **changed)

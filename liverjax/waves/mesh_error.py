@@ -13,6 +13,7 @@ from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.scenes.enriched import enriched
 from liverjax.scenes.refined import REFINED, Within, can_be_refined, on_refined_mesh
 from liverjax.scenes.scene import Scene
+from liverjax.simulation.automatic import form_of_volumes
 from liverjax.solvers.point_matrix import restricted
 from liverjax.waves.harmonic import Harmonic, harmonic
 from liverjax.waves.rest import under_its_weight
@@ -101,7 +102,7 @@ def _richer_elements(scene: Scene) -> Scene:
     if rich.mesh.order == 3:
         # Cubic elements do not lock. If the pressures of quadratic elements are unknowns, they stay unknowns. The
         # estimate would otherwise contain the different treatment of the volume, and be a third too small.
-        volumetric = "mixed" if scene.solve.volumetric == "mixed" else "element"
+        volumetric = "mixed" if form_of_volumes(scene) == "mixed" else "element"
         return replace(rich, solve=replace(rich.solve, volumetric=volumetric))
     if scene.solve.volumetric == "nodal":
         return replace(rich, solve=replace(rich.solve, volumetric="mixed"))

@@ -60,9 +60,12 @@ def under_its_weight(scene: Scene) -> jax.Array | None:
 
 
 def _check_spring(scene: Scene) -> None:
-    """Raise InputError if the springpots have no spring, so that the body has no shear stiffness at rest."""
-    spring = None if scene.springpots is None else scene.springpots.spring
-    if spring is not None and not isinstance(spring, jax.core.Tracer) and not np.any(np.asarray(spring)):
+    """Raise InputError if spring and springpots leave no shear stiffness at rest."""
+    own = scene.springpots
+    if own is None or any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((own.spring, own.exponents))):
+        return
+    # Inside jit, jnp makes tracers of known numbers too, so this check uses NumPy.
+    if not (np.any(np.asarray(own.spring)) or np.any(np.asarray(own.exponents) == 0)):
         raise InputError(
             "springpots.spring = 0 leaves no shear stiffness at rest, so the body has no state of rest under gravity "
             "or tension: give spring above 0, remove the gravity, or give a state of rest as the argument 'about'"

@@ -57,10 +57,7 @@ def check_choices(scene: Scene) -> None:
         )
     if scene.solve.linear_solver == "direct" and any(physics.ties for physics in scene.physics):
         raise InputError("[solve] linear_solver = 'direct' cannot be used with a rigid plate: use linear_solver = 'cg'")
-    if scene.solve.volumetric in ("nodal", "mixed"):
-        _own_volumes(scene)
-    if scene.solve.volumetric == "mixed":
-        _mixed(scene)
+    check_volumetric(scene)
     if scene.viscosity is not None:
         for law in laws_of(scene.law, scene.region):
             viscosity.check_part(scene.viscosity.part, law, "viscosity")
@@ -88,11 +85,14 @@ def _loaded(scene: Scene) -> None:
         raise InputError('[mesh] is = "loaded" cannot be used with a rigid plate: remove the plate')
 
 
-def _mixed(scene: Scene) -> None:
-    check_mixed_laws(laws_of(scene.law, scene.region))
+def check_volumetric(scene: Scene) -> None:
+    """Check that the materials of a scene can be used with its setting `volumetric`. No other setting has an effect.
 
-
-def _own_volumes(scene: Scene) -> None:
+    Raises:
+        InputError: the materials do not allow pressures as unknowns.
+    """
+    if scene.solve.volumetric not in ("nodal", "mixed"):
+        return
     name = f"[solve] volumetric = {scene.solve.volumetric!r}"
     if scene.porosity is not None:
         raise InputError(
@@ -110,3 +110,5 @@ def _own_volumes(scene: Scene) -> None:
             f"{name} needs a volumetric stress that does not relax: use part = 'isochoric' in [viscosity] or "
             "[springpots]"
         )
+    if scene.solve.volumetric == "mixed":
+        check_mixed_laws(several)
