@@ -425,3 +425,15 @@ def test_quadratic_elements_that_cannot_have_pressures_are_told_that_they_lock()
     assert cautions.of_locking(waves)[0].endswith("part = 'isochoric' in [springpots]")
     continued = replace(stiff, law=lj.laws.continued(stiff.law, 0.1))
     assert cautions.of_locking(continued)[0].endswith("too stiff: use a finer mesh")
+
+
+def test_the_locking_warning_uses_the_moduli_of_each_region():
+    """The law of the scene was asked, also where a region changes its bulk modulus or replaces it."""
+    soft = replace(scene(lj.quadratic(BOX), volumetric="element"), law=lj.laws.NeoHookean(mu=1000.0, bulk=5000.0))
+    E = soft.mesh.number_of_elements
+    half, stiff = np.arange(E // 2), replace(soft.law, bulk=1e6)
+    for law in ({"bulk": 1e6}, stiff):
+        (said,) = cautions.of_locking(replace(soft, region=(lj.Region(elements=half, law=law),)))
+        assert said.startswith("the bulk modulus is 1e+03 times the shear modulus")
+    covered = replace(soft, law=stiff, region=(lj.Region(elements=np.arange(E), law=soft.law),))
+    assert cautions.of_locking(soft) == cautions.of_locking(covered) == []

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 import liverjax as lj
+from liverjax.core.struct import replace
 from liverjax.elements import mjed, reference
-from liverjax.scenes.by_element import law_of_elements
+from liverjax.scenes.by_element import by_element, law_of_elements
+from liverjax.scenes.checks.numbers import check_numbers
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -168,3 +170,73 @@ def test_directions_in_a_body_of_three_elements():
         split = law_of_elements(law, (lj.Region(elements=jnp.array([1]), law=law),), 3)
         for body, own in ((lj.quadratic(mesh), law), (mesh, split)):
             assert np.isclose(mjed.energy(body, own, body.points @ F), whole, rtol=1e-12)
+
+
+def test_the_fibres_of_a_region_may_have_another_direction():
+    """Such a region passed all checks, but the run was refused with the shape (3, 48) of its directions."""
+    law = lj.laws.Costa(**COSTA)
+    mesh = lj.shapes.box((0.02, 0.01, 0.01), (2, 1, 1))
+    half = np.arange(mesh.number_of_elements // 2)
+    rows = np.tile([1.0, 0.0, 0.0], (mesh.number_of_elements, 1))
+    turned = rows.copy()
+    turned[half] = (0.0, 0.3, 1.0)
+    for body, name in (
+        (law, "fibre"),
+        (lj.laws.Costa(**COSTA, fibre=rows), "fibre"),
+        (lj.laws.NeoHookean(mu=1.0, bulk=None) + law, "1.fibre"),
+    ):
+        region = lj.Region(elements=half, law={f"{name}.{k}": v for k, v in enumerate((0.0, 0.3, 1.0))})
+        scene = lj.Scene(mesh=mesh, law=body, region=(region,))
+        check_numbers(scene)
+        assert np.array_equal(by_element(scene).law.summands()[-1].fibre, turned)
+    F, whole = np.diag([1.1, 0.9, 1.0]), lj.laws.Costa(**COSTA, fibre=(0.0, 0.3, 1.0))
+    by_region = law_of_elements(law, (lj.Region(elements=half, law=whole),), mesh.number_of_elements)
+    found = mjed.energy(mesh, lj.laws.Costa(**COSTA, fibre=turned), mesh.points @ F)
+    assert np.isclose(found, mjed.energy(mesh, by_region, mesh.points @ F), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("fibre", "sentence"),
+    [
+        ((0.0, 0.0, 0.0), "region.0: law costa: .* one of them is zero"),
+        ((0.0, 1.0, 0.0), "region.0: law costa: the directions 'fibre' and 'sheet' are parallel"),
+        ((0.0, 1.0), "region.0: law.fibre does not have three components: give three numbers"),
+    ],
+)
+def test_unusable_directions_of_a_region_are_refused(fibre, sentence):
+    mesh = lj.shapes.box((0.02, 0.01, 0.01), (2, 1, 1))
+    region = lj.Region(elements=np.array([1]), law={f"fibre.{k}": v for k, v in enumerate(fibre)})
+    with pytest.raises(lj.InputError, match=sentence):
+        check_numbers(lj.Scene(mesh=mesh, law=lj.laws.Costa(**COSTA), region=(region,)))
+
+
+def test_directions_of_regions_are_compared_within_each_element():
+    """The fibres of a region were compared with the sheets of all elements, and with those of the scene where another
+    region changes them. Regions were refused although no element had parallel directions."""
+    mesh = lj.shapes.box((0.02, 0.01, 0.01), (2, 1, 1))
+    n, (x, y, z) = mesh.number_of_elements, np.eye(3)
+
+    def region(elements, **directions):
+        law = {f"{name}.{k}": v for name, own in directions.items() for k, v in enumerate(own)}
+        return lj.Region(elements=np.array(elements), law=law)
+
+    def check(law, *regions):
+        check_numbers(lj.Scene(mesh=mesh, law=law, region=regions))
+
+    sheet = np.tile(z, (n, 1))
+    sheet[:2] = y
+    law = lj.laws.Costa(**(COSTA | {"fibre": x, "sheet": sheet}))
+    check(law, region([0, 1], fibre=z))
+    check(law, region([0, 1, 2], sheet=y), region([0, 2], fibre=z), region([1], fibre=y, sheet=z))
+    for regions, named in (
+        ([region([1, 2], fibre=z)], "region.0"),
+        ([region([0], sheet=z), region([0, 1], fibre=z)], "region.0, region.1"),
+    ):
+        with pytest.raises(
+            lj.InputError, match=f"^{named}: law costa: the directions 'fibre' and 'sheet' are parallel"
+        ):
+            check(law, *regions)
+    jax.jit(lambda k: check(law, region([1, 2], fibre=(0.0, 0.0, k))))(1.0)  # unknown directions are not checked
+    with pytest.raises(lj.InputError, match=r"region.0: law costa"):
+        jax.jit(lambda c: check(replace(law, c=c), region([1, 2], fibre=z)))(1.0)
+    check(law, region([n], fibre=z))  # wrong element numbers are refused by another check

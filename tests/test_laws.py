@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 import liverjax as lj
+from liverjax.core.struct import replace
 from liverjax.laws.derivatives import autodiff_derivatives
-from liverjax.tensors.matrices import Invariants
+from liverjax.laws.terms import chapter_terms, invariant_terms
+from liverjax.tensors.matrices import Invariants, pack, unpack
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -281,3 +283,22 @@ def test_create_under_tracing_and_optional_parameters():
     assert LAWS["costa"].tangent(jnp.eye(3, dtype=jnp.float32)).dtype == jnp.float32
     integer = np.array([[2, 0, 0], [0, 1, 0], [0, 0, 1]])
     assert np.allclose(LAWS["neo_hookean"].first_piola(integer), LAWS["neo_hookean"].first_piola(integer * 1.0))
+
+
+def test_a_sum_of_sums_is_one_sum():
+    """The stress of the laws in an inner sum was lost, and `scaled` raised KeyError."""
+    a, b, c = (LAWS[name] for name in ("ogden", "neo_hookean", "yeoh"))
+    nested = lj.laws.Sum(laws=(lj.laws.Sum(laws=(a, b)), c))
+    F = jnp.asarray(random_gradients(1)[0])
+    assert np.allclose(nested.first_piola(F), sum(law.first_piola(F) for law in (a, b, c)), rtol=1e-12)
+    assert np.isclose(lj.laws.scaled(nested, 2.0).energy(F), 2 * nested.energy(F), rtol=1e-12)
+    assert jax.tree.structure(nested) == jax.tree.structure(a + b + c)
+    assert replace(nested, laws=(a + b, c)).laws == (a, b, c)
+
+
+def test_the_terms_of_the_chapter_know_the_continued_volume():
+    """The terms "chapter" did not use `below`, so a flat element had a larger pressure."""
+    law = lj.laws.NeoHookean(mu=500.0, bulk=None) + lj.laws.Volumetric(bulk=5000.0, volumetric="log", below=0.5)
+    F = unpack(jnp.diag(jnp.array([1.0, 1.0, 0.3])))
+    P, of_chapter = (np.asarray(pack(terms.first_piola(law, F))) for terms in (invariant_terms, chapter_terms))
+    assert np.allclose(of_chapter, P, rtol=1e-12)

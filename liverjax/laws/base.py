@@ -134,9 +134,16 @@ def _floating(F: Number) -> jax.Array:
 
 @struct
 class Sum(Law):
-    """Several laws acting in parallel. The energy is the sum of their energies."""
+    """Several laws acting in parallel. The energy is the sum of their energies.
+
+    A sum among `laws` is replaced by its laws, so no law of a `Sum` is a `Sum`.
+    """
 
     laws: tuple = unnamed("laws whose energies are added")
+
+    def __post_init__(self):
+        flat = tuple(part for law in self.laws for part in (law.laws if isinstance(law, Sum) else (law,)))
+        object.__setattr__(self, "laws", flat)
 
     def summands(self):
         """Return the laws of the sum."""

@@ -3,6 +3,7 @@
 If a region has another kind of law, this law is computed only for the elements of the region.
 """
 
+import jax
 import jax.numpy as jnp
 
 from liverjax.core import names
@@ -12,7 +13,15 @@ from liverjax.laws.by_region import ByRegion
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.porosity import Porosity
 from liverjax.physics.viscosity import Prony
-from liverjax.scenes.regions import POROUS, VISCOUS, Region, changed_numbers, law_number, refused_name
+from liverjax.scenes.regions import (
+    POROUS,
+    VISCOUS,
+    Region,
+    changed_directions,
+    changed_numbers,
+    law_number,
+    refused_name,
+)
 from liverjax.scenes.scene import Scene
 from liverjax.tensors.subsets import subsets
 
@@ -33,22 +42,33 @@ def by_element(scene: Scene) -> Scene:
 def law_of_elements(law: Law, regions: tuple[Region, ...], number_of_elements: int) -> Law:
     """Return the law of the body: the law of the scene, with the parameters and laws of its regions.
 
-    A parameter has one value per element (E,) if a region changes it. If a region has a complete law, the result is a
-    `ByRegion` of all laws.
+    A parameter has one value per element (E,), and a direction one row per element (E, 3), if a region changes it. If a
+    region has a complete law, the result is a `ByRegion` of all laws.
 
     Raises:
         InputError: a region changes a parameter that the law does not have.
     """
+    directions = sorted({name for region in regions for name in changed_directions(region)})
+    for name in directions:  # as a tuple of the three components
+        law = names.put(law, name, tuple(jnp.moveaxis(_direction_in(law, name), -1, 0)), refused_name(name))
     for region in regions:
         for name, value in changed_numbers(region).items():
             base = jnp.broadcast_to(jnp.asarray(law_number(law, name), float), (number_of_elements,))
             law = names.put(law, name, base.at[region.elements].set(value), refused_name(name))
+    for name in directions:
+        law = names.put(law, name, _direction_in(law, name), refused_name(name))
     own = [(region.law, region.elements) for region in regions if isinstance(region.law, Law)]
     if not own:
         return law
     groups = subsets([elements for _, elements in own], number_of_elements)
     kinds = tuple(kind for kind, _ in own)
     return ByRegion(laws=kinds if len(kinds) == len(groups.elements) else (law, *kinds), subsets=groups)
+
+
+def _direction_in(law: Law, name: str) -> jax.Array:
+    """Return a direction of the law as an array (3,), or (E, 3) with one row per element."""
+    value = names.get(law, name, refused_name(name))
+    return jnp.stack(value, axis=-1) if isinstance(value, tuple) else jnp.asarray(value)
 
 
 def viscosity_of_elements(prony: Prony, regions: tuple[Region, ...], number_of_elements: int) -> Prony:

@@ -104,6 +104,12 @@ def changed_numbers(region: Region) -> dict[str, object]:
     return region.law if isinstance(region.law, dict) else {}
 
 
+def changed_directions(region: Region) -> list[str]:
+    """Return the names of the directions, such as `fibre` or `1.sheet`, with a component that the region changes."""
+    owners = {name.rpartition(".")[0] for name in changed_numbers(region)}
+    return sorted(name for name in owners if name.rpartition(".")[2] in ("fibre", "sheet"))
+
+
 def set_by_regions(regions: tuple[Region, ...], name: str, number_of_elements: int) -> tuple[np.ndarray, np.ndarray]:
     """Return for each element whether a region changes a parameter such as `law.mu` (E,), and the new value (E,).
 

@@ -25,7 +25,6 @@ from liverjax.physics.loads import dead_loads, follows
 from liverjax.physics.porosity import law_in_force
 from liverjax.physics.rigid_plate import RigidPlate
 from liverjax.physics.sliding_support import SlidingSupport
-from liverjax.scenes import regions
 from liverjax.scenes.by_element import by_element
 from liverjax.scenes.checks.histories import cautions_of_histories
 from liverjax.scenes.checks.rigid_motion import loose_piece
@@ -163,8 +162,8 @@ def of_locking(scene: Scene) -> list[str]:
     if scene.mesh.order == 1 or form_of_volumes(scene) != "element" or scene.porosity is not None:
         return []
     try:
-        laws = regions.laws_of(scene.law, scene.region)
-        ratio = max(float(np.max(np.asarray(a.bulk_modulus()) / np.asarray(a.shear_modulus()))) for a in laws)
+        law = by_element(scene).law
+        ratio = float(np.max(np.asarray(law.bulk_modulus()) / np.asarray(law.shear_modulus())))
     except InputError:  # a law may have no moduli
         return []
     if ratio <= _LOCKING:
@@ -191,7 +190,7 @@ def _of_growing_motion(scene: Scene, result: Result) -> list[str]:
         return []
     momentum = partial(inertia_forces, *Inertia(density=body.density, mass=body.mass).masses_on(scene.mesh))
     x = np.concatenate([np.asarray(scene.mesh.points)[None], np.asarray(result.positions)])
-    force = np.asarray(dead_loads(scene.mesh, body.density, body.gravity, scene.traction))
+    force = np.asarray(dead_loads(scene.mesh, body.density, body.gravity, scene.traction, body.mass))
     work = np.sum((x - x[0]) * force, axis=(1, 2))
     velocity = np.diff(x, axis=0) / float(solve.dt)
     moving = 0.5 * np.sum(velocity * np.asarray(jax.lax.map(momentum, velocity)), axis=(1, 2))

@@ -17,7 +17,6 @@ from liverjax.laws.families.neo_hookean import NeoHookean, NeoHookeanCompressibl
 from liverjax.laws.families.saint_venant_kirchhoff import SaintVenantKirchhoff
 from liverjax.laws.families.veronda_westmann import VerondaWestmann
 from liverjax.laws.families.yeoh import Yeoh
-from liverjax.laws.volumetric import volumetric
 from liverjax.tensors.matrices import Invariants
 
 
@@ -97,4 +96,8 @@ def functions_of_volume(law: Law, J: Number) -> list[tuple[jax.Array, jax.Array]
     if isinstance(law, NeoHookeanCompressible):
         first, second = law.energy_derivatives(Invariants(J=J))
         return [(first["J"], second["J", "J"])]
-    return [] if law.bulk is None else [volumetric(law.volumetric, law.bulk, J)[1:]]
+    volume = law.volumetric_part()
+    if volume is None:
+        return []
+    first, second = volume.energy_derivatives(Invariants(J=J))
+    return [(first["J"], second["J", "J"])]

@@ -11,7 +11,15 @@ from liverjax.core.struct import Content, replace
 from liverjax.laws import Law
 from liverjax.physics.porosity import Porosity, check_sponge
 from liverjax.physics.viscosity import Prony, check_series
-from liverjax.scenes.regions import POROUS, VISCOUS, Region, changed_numbers, law_number, refused_name
+from liverjax.scenes.regions import (
+    POROUS,
+    VISCOUS,
+    Region,
+    changed_directions,
+    changed_numbers,
+    law_number,
+    refused_name,
+)
 from liverjax.scenes.scene import Scene
 
 
@@ -20,12 +28,13 @@ def check_region_numbers(scene: Scene) -> None:
 
     Raises:
         InputError: a region changes [viscosity] or [porosity], but the scene has none; a name is unknown; a value is
-            out of bounds; or the number of modes is wrong.
+            out of bounds; a direction is incomplete or unusable; or the number of modes is wrong.
     """
     for k, region in enumerate(scene.region):
         _check_law(scene.law, region, f"region.{k}")
         check_region_viscosity(scene.viscosity, region, f"region.{k}")
         check_region_porosity(scene.porosity, region, f"region.{k}")
+    _check_directions(scene)
 
 
 def check_region_elements(scene: Scene) -> None:
@@ -52,6 +61,50 @@ def _check_law(law: Law, region: Region, name: str) -> None:
         law_number(law, number)
         metadata = names.metadata(law, number, refused_name(number)) | {"each": False}
         laws.check_value(f"{name}: law.{number}", metadata, value)
+    own = changed_numbers(region)
+    for direction in changed_directions(region):
+        if any(f"{direction}.{k}" not in own for k in range(3)):
+            raise InputError(f"{name}: law.{direction} does not have three components: give three numbers")
+
+
+def _check_directions(scene: Scene) -> None:
+    """Raise InputError if regions give an element directions that the law cannot have, for example parallel ones.
+
+    Directions inside jit, grad or vmap, and wrong element numbers, are not checked here.
+    """
+    law, turning = scene.law, {k: own for k, own in enumerate(scene.region) if changed_directions(own)}
+    for direction in sorted({name for region in turning.values() for name in changed_directions(region)}):
+        rows = _rows_of_direction(scene, direction)
+        if rows is None:
+            return
+        law = names.put(law, direction, rows, refused_name(direction))
+    try:
+        for part in law.summands() if turning else ():
+            part.check_directions()
+    except InputError as error:
+        raise InputError(f"{', '.join(f'region.{k}' for k in turning)}: {error}") from None
+
+
+def _rows_of_direction(scene: Scene, direction: str) -> np.ndarray | None:
+    """Return a direction in all elements (E, 3), with the changes by the regions. Return None if values or element
+    numbers are unknown or wrong."""
+    n, value = scene.mesh.number_of_elements, names.get(scene.law, direction, refused_name(direction))
+    changes = []
+    for region in scene.region:
+        own = changed_numbers(region)
+        if f"{direction}.0" in own:
+            changes.append((region.elements, [own[f"{direction}.{k}"] for k in range(3)]))
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((value, changes))):
+        return None
+    if np.shape(value) not in ((3,), (n, 3)):
+        return None
+    rows = np.broadcast_to(np.asarray(value, float), (n, 3)).copy()
+    for elements, vector in changes:
+        places = np.asarray(elements)
+        if places.dtype.kind not in "iu" or np.any((places < 0) | (places >= n)):
+            return None
+        rows[places] = vector
+    return rows
 
 
 def check_region_viscosity(prony: Prony | None, region: Region, name: str) -> None:
