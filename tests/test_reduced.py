@@ -9,7 +9,9 @@ from conftest import every_motion, moves_as_full
 
 import liverjax as lj
 from liverjax.core.struct import replace
-from liverjax.reduced import estimate, training
+from liverjax.mesh.nodal import nodal_volumes
+from liverjax.physics.prescribed import free_degrees
+from liverjax.reduced import estimate, sampling, training
 from liverjax.reduced.correction import Learnt, _least_squares, correction_at, learnt_correction, stated_at
 from liverjax.reduced.model import as_matrix, refuse_unseen_numbers, solid_at_points, with_all_points
 from liverjax.reduced.sampling import MOST_STATES, Coordinates, nonnegative_weights, sampled, states_of
@@ -162,6 +164,8 @@ def test_weights_give_all_forces_and_are_few():
     xi = nonnegative_weights(G, np.ones(200), 1e-8)
     assert np.all(xi >= 0) and np.count_nonzero(xi) <= 7
     assert np.allclose(G @ xi, G.sum(axis=1), rtol=0, atol=1e-8 * np.abs(G).sum(axis=1).max())
+    with pytest.raises(lj.InputError, match="no state of the training runs has a motion with finite stresses"):
+        nonnegative_weights(G[:0], np.ones(200), 1e-8)
 
 
 def test_an_inverse_follows_the_forces_and_stays_symmetric_and_positive():
@@ -210,6 +214,26 @@ def test_a_state_that_is_inside_out_or_at_rest_has_no_say_in_the_points(trained)
     beside = sampled(whole, scene, {"law.mu": np.array([mu, mu])}, both, 1e-3)
     assert len(alone.points) > 1
     assert np.array_equal(alone.points, beside.points) and np.allclose(alone.weights, beside.weights, rtol=1e-9)
+
+
+def test_points_of_a_body_that_is_only_moved():
+    """Without a load the forces cancel, so states were divided by roundoff or were regarded as at rest."""
+    scene = replace(_bar((2, 1, 1)), body=None)
+    end = jnp.asarray(lj.boundary.select(scene.mesh, {"x_min": 0.03}, None, "displaced"))
+    scene = replace(scene, displaced=(lj.Displaced(nodes=end, by=jnp.array([0.003, 0.0, 0.002])),))
+    values = {"displaced.0.by": np.array([[0.003, 0, 0.002], [0.001, 0, 0.003], [0.002, 0.002, 0], [-0.002, 0.001, 0]])}
+    u = np.asarray(lj.simulate_batch(scene, values).result.positions) - np.asarray(scene.mesh.points)
+    u = u * np.asarray(free_degrees(scene.mesh, scene.fixed, scene.displaced))
+    volumes = np.asarray(nodal_volumes(scene.mesh))
+    whole = with_all_points(scene, jnp.asarray(training.proper_modes(u[:, 0], volumes, 1e-8)))
+    q = jnp.einsum("rtvc,nvc->rtn", u * volumes[:, None], whole.modes)
+    model = sampled(whole, scene, values, Coordinates(q, None), 1e-8)
+    compliance = sampling._reduced_compliance(whole, scene)
+    for by, own in zip(values["displaced.0.by"], q, strict=True):
+        moved = lj.with_parameters(scene, {"displaced.0.by": by})
+        forces, _ = sampling._contributions(model, moved, (own, None), jnp.arange(1))
+        motion = compliance @ np.asarray(forces[0]).sum(axis=1)  # of the forces that do not cancel
+        assert np.linalg.norm(motion) < 1e-7 * np.linalg.norm(own)
 
 
 def test_the_error_is_stated(trained):
@@ -484,6 +508,7 @@ def test_foreign_and_damaged_files_are_one_sentence(trained, tmp_path):
     damaged = {
         "slopes has shape": replace(whole, weights=whole.weights[:-1]),
         "points has shape": replace(whole, points=whole.points[1:]),
+        r"ranges of law.mu has shape \(3,\), not \(2,\)": replace(whole, ranges={"law.mu": jnp.ones(3)}),
         "modes has values that are not finite": replace(whole, modes=whole.modes.at[0, 0, 0].set(jnp.nan)),
         "inverse has shape": replace(whole, correction=replace(learnt, inverse=learnt.inverse[1:])),
     }

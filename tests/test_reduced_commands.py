@@ -100,3 +100,9 @@ REFUSED = """
 reduced = "model.h5"
 reduced_tolerance = 1e-9
 """
+
+
+def test_an_empty_name_is_no_reduced_model(tmp_path):
+    """The folder of the scene was put before the empty name, and was then taken for the model."""
+    (tmp_path / "scene.toml").write_text(SCENE + 'reduced = ""\n')
+    assert lj.load_scene(tmp_path / "scene.toml").solve.reduced == ""

@@ -93,14 +93,17 @@ def _wrong(model: ReducedModel) -> str:
     arrays = {name: getattr(model, name) for name in shapes}
     own, fluid = model.correction, model.pressures
     if own is not None:
-        k, m = jnp.shape(own.factors)
+        (k, m), R = jnp.shape(own.factors), jnp.size(own.left)
         shapes |= {"fields": (m, V, 3), "factors": (k, m), "inverse": (k, k), "scale": (), "statement": (4,)}
-        arrays |= {name: getattr(own, name) for name in ("fields", "factors", "inverse", "scale", "statement")}
+        shapes |= {"left": (R,), "ratios": (R,)}
+        arrays |= {name: getattr(own, name) for name in _LEARNT}
     if fluid is not None:
         m, vertices = jnp.shape(fluid.modes)
         of_fluid = {"modes": (m, vertices), "values": (S, m), "parts": (m, 4, S), "slopes": (m, 3, S)}
         shapes |= {f"pressures.{name}": shape for name, shape in of_fluid.items()}
         arrays |= {f"pressures.{name}": getattr(fluid, name) for name in of_fluid}
+    for name, bounds in model.ranges.items():
+        shapes[f"ranges of {name}"], arrays[f"ranges of {name}"] = (2, *jnp.shape(bounds)[1:]), bounds
     for name, array in arrays.items():
         if jnp.shape(array) != shapes[name]:
             return f"{name} has shape {jnp.shape(array)}, not {shapes[name]}"

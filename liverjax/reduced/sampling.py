@@ -37,7 +37,7 @@ from liverjax.tensors.principal_fields import principal_fields
 
 #: Maximum number of training states whose forces are used. The required memory and time increase with this number.
 MOST_STATES = 240
-#: A state is not used if its forces cause a motion below this fraction [1] of the largest coordinate, because such a
+#: A state is not used if its size (see `sampled`) is below this fraction [1] of the largest coordinate, because such a
 #: motion is roundoff.
 LEAST_MOTION = 1e-9
 
@@ -55,7 +55,9 @@ def sampled(
     """Select a few points from a model with all points, using the coordinates of R training runs. Return the model with
     these points.
 
-    States at rest are not used. States with an inverted element are not used if the law has no finite stress there.
+    The size of a state is the norm of the motions that its forces cause, or the norm of its coordinates if this is
+    larger. The rows of G are divided by this size. States at rest are not used. States with an inverted element are not
+    used if the law has no finite stress there.
 
     Args:
         whole: model with all points, from `with_all_points`.
@@ -72,8 +74,10 @@ def sampled(
         forces, volumes = _contributions(whole, own, (jnp.asarray(q[r]), p), jnp.asarray(times))
         # Forces are converted to motions, because forces on stiff modes are large but cause little motion.
         G = compliance @ np.asarray(forces)
-        size = np.linalg.norm(G.sum(axis=2), axis=1)
-        # States are not used if some stress is not finite (inverted elements) or if the body is at rest (no forces).
+        # If no load acts (prescribed displacements), the forces of the points cancel, and only the coordinates show the
+        # size of the motion.
+        size = np.maximum(np.linalg.norm(G.sum(axis=2), axis=1), np.linalg.norm(np.asarray(q[r])[times], axis=1))
+        # States are not used if some stress is not finite (inverted elements) or if the body is at rest.
         good = np.isfinite(G).all(axis=(1, 2)) & (size > LEAST_MOTION * np.abs(q).max())
         rows.append((G[good] / size[good, None, None]).reshape(-1, whole.weights.size))
         if volumes is not None:
@@ -206,8 +210,8 @@ def nonnegative_weights(G: np.ndarray, volumes: np.ndarray, tolerance: float) ->
 
     if not len(G):
         raise InputError(
-            "the training runs contain no forces, so no points can be selected: give two or more different parameter "
-            "sets"
+            "no state of the training runs has a motion with finite stresses, so no points can be selected: give other "
+            "loads or prescribed motions"
         )
     # The rows of V have length 1, so singular vectors with small and with large singular values have the same weight.
     V = principal_fields(G, tolerance)

@@ -182,14 +182,14 @@ def _of_two_kinds(name: str, given: set[str], kinds: list[set[str]]) -> str:
 
 
 def _with_paths(content: object, folder: Path) -> Any:
-    """Put `folder` before all paths in the content: histories, surfaces and a reduced model."""
+    """Put `folder` before all paths in the content: histories, surfaces and a reduced model. An empty name stays."""
     if isinstance(content, list):
         return [_with_paths(value, folder) for value in content]
     if not isinstance(content, dict):
         return content
     return {
         key: str(folder / value)
-        if key in ("history", "reduced", "surface") and isinstance(value, str)
+        if key in ("history", "reduced", "surface") and isinstance(value, str) and value
         else _with_paths(value, folder)
         for key, value in content.items()
     }
