@@ -162,6 +162,56 @@ def test_several_blocks_of_one_set_give_the_sets_of_one_block(tmp_path):
     assert len(read.triangle_sets["sole"]) == 8
 
 
+def test_nodes_of_a_set_of_elements_are_those_of_the_named_set(tmp_path):
+    """The part and the assembly have a set of elements `hard`. The part's set of nodes got the nodes of the assembly's
+    set, and a name with the instance gave an empty set."""
+    head = HEAD.replace("*Node, nset=all", "*Part, name=Liver\n*Node, nset=all")
+    cards = """*Elset, elset=hard
+101
+*Nset, nset=own, elset=hard
+*End Part
+*Assembly, name=Assembly
+*Instance, name=Liver-1, part=Liver
+*End Instance
+*Elset, elset=hard, instance=Liver-1
+102
+*Nset, nset=whole, elset=Hard
+*Nset, nset=inner, elset=Liver-1.hard
+*Surface, name=left
+Liver-1.hard, S1
+*Surface, name=right
+hard, S1
+*End Assembly
+"""
+    (tmp_path / "m.inp").write_text(head + cards)
+    mesh = lj.read_mesh(tmp_path / "m.inp")
+    found = {name: sorted(np.asarray(mesh.node_sets[name]).tolist()) for name in ("own", "whole", "inner")}
+    assert found == {"own": [0, 1, 2, 3], "whole": [1, 2, 3, 4], "inner": [0, 1, 2, 3]}
+    faces = {name: sorted(np.ravel(mesh.triangle_sets[name]).tolist()) for name in ("left", "right")}
+    assert faces == {"left": [0, 1, 2], "right": [1, 2, 4]}
+
+
+@pytest.mark.parametrize("name", ["low", "Assembly.low", "Liver-1.low"])
+def test_a_set_of_the_assembly_may_have_a_name_before_it(tmp_path, name):
+    """With a name before it, this set of elements was not found."""
+    head = HEAD.replace("*Node, nset=all", "*Part, name=Liver\n*Node, nset=all")
+    cards = f"""*End Part
+*Assembly, name=Assembly
+*Instance, name=Liver-1, part=Liver
+*End Instance
+*Elset, elset=low, instance=Liver-1
+102
+*Nset, nset=nodes, elset={name}
+*Surface, name=faces
+{name}, S1
+*End Assembly
+"""
+    (tmp_path / "m.inp").write_text(head + cards)
+    mesh = lj.read_mesh(tmp_path / "m.inp")
+    assert sorted(np.asarray(mesh.node_sets["nodes"]).tolist()) == [1, 2, 3, 4]
+    assert sorted(np.ravel(mesh.triangle_sets["faces"]).tolist()) == [1, 2, 4]
+
+
 def test_quadratic_elements_and_included_files(tmp_path):
     mesh = lj.quadratic(lj.shapes.box((1, 1, 1), (1, 1, 1)))
     meshio.Mesh(np.asarray(mesh.points), [meshio_cells(mesh)]).write(tmp_path / "inner.inp")
@@ -182,6 +232,7 @@ def test_quadratic_elements_and_included_files(tmp_path):
         ("*ELEMENT, TYPE=C3D9\n103" + 9 * ", 11" + "\n", "elements of type C3D9; export tetrahedra"),
         ("*NODE\n16, 1, one, 1\n", "contains a wrong number"),
         ("*NSET, NSET=foot\nnobody\n", "contains nobody, but the file does not define this set"),
+        ("*NSET, NSET=foot, ELSET=None\n", r"\*NSET contains None, but the file does not define this set"),
         ("*NSET, NSET=foot, GENERATE\n1, 2, 0\n", "give first, last, step"),
         ("*NGEN\n11, 15\n", r"\*NGEN moves or creates nodes or elements"),
         ("*INSTANCE, NAME=one, PART=two\n0, 0, 5\n", r"\*INSTANCE moves or creates nodes or elements"),

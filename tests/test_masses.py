@@ -8,10 +8,11 @@ from test_quadratic import crooked
 
 import liverjax as lj
 from liverjax.core.struct import replace
-from liverjax.mesh.nodal import load_volumes
+from liverjax.mesh.nodal import load_volumes, nodal_volumes
 from liverjax.mesh.promotion import cubic
-from liverjax.physics.base import Free, Start
-from liverjax.physics.inertia import Inertia
+from liverjax.physics.base import Free, Start, Step
+from liverjax.physics.inertia import Inertia, inertia_forces
+from liverjax.physics.registry import physics_of
 from liverjax.solvers import attached
 
 pytestmark = pytest.mark.quick_to_compile
@@ -59,12 +60,65 @@ def test_masses_integrate_products_of_functions(order):
     assert np.isclose(moment, exact, rtol=1e-13)
 
 
-def test_numbers_by_node_are_means_by_element():
+def test_numbers_by_node_have_the_sum_of_the_lumped_masses():
+    """The masses used only the densities of the vertices."""
     mesh = MESHES[2]
     density = jnp.linspace(900.0, 1100.0, mesh.number_of_nodes)
     mass, shared = Inertia(density=density, mass="consistent").masses_on(mesh)
     total = jnp.sum(mass) + jnp.sum(jnp.stack(attached.product(shared, (jnp.ones_like(mass),))))
-    assert np.isclose(total, jnp.sum(mesh.volumes * density[mesh.tetrahedra].mean(axis=1)), rtol=1e-13)
+    assert np.isclose(total, jnp.sum(density * nodal_volumes(mesh)), rtol=1e-13)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_free_body_of_two_densities_falls_as_one(order):
+    """The weight belonged to other densities than the mass, so the body bent, and the mesh error of the undeformed fall
+    with lumped masses was not zero.
+    """
+    density = jnp.where(MESHES[order].points[:, 0] < 0.011, 1000.0, 2000.0)
+    scene = falling(order, "lumped" if order == 1 else "consistent", tolerance=1e-10)
+    scene = replace(scene, body=replace(scene.body, density=density))
+    result = lj.simulate(scene, mesh_error=order == 1).check()
+    way = fallen(scene)
+    assert np.abs(result.positions - scene.mesh.points[None] - way).max() < 1e-8 * np.abs(way).max()
+    if order == 1:
+        assert np.abs(result.mesh_error.positions).max() < 1e-8 * np.abs(way).max()
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_the_weight_of_two_densities_is_their_mass_times_gravity(order):
+    """The weight belonged to other densities than the mass, so a free body bent."""
+    scene = falling(order, "consistent")
+    density = 1000.0 * (1 + jnp.arange(scene.mesh.number_of_nodes) % 2)
+    _, inertia, loads = physics_of(replace(scene, body=replace(scene.body, density=density)))
+    mass, shared = inertia.masses_on(scene.mesh)
+    whole = scene.mesh.number_of_vertices + (order > 1) * scene.mesh.pattern.edges.shape[1]
+    falls = jnp.zeros_like(scene.mesh.points).at[:whole].set(GRAVITY)
+    step = Step(scene.mesh, scene.mesh.points, 1.0, 4, 0.002, True, 1e-8, Free(jnp.ones_like(falls)))
+    weight = -loads.freeze(None, step).force(scene.mesh, scene.mesh.points, 1.0)
+    off = weight - inertia_forces(mass, shared, falls)
+    assert np.abs(off).max() < 1e-13 * np.abs(weight).max()
+    assert np.allclose(weight[:whole].sum(axis=0), jnp.sum(inertia.density * nodal_volumes(scene.mesh)) * GRAVITY)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+@pytest.mark.parametrize("mass", ["lumped", "consistent"])
+def test_a_body_of_two_densities_has_one_weight(order, mass):
+    """With consistent masses, static and dynamic scenes had different weights. With quadratic elements and lumped
+    masses, the total weight was not the total mass times gravity.
+    """
+    scene = falling(order, mass)
+    density = 1000.0 * (1 + jnp.arange(scene.mesh.number_of_nodes) % 2)
+    scene = replace(scene, body=replace(scene.body, density=density))
+    step = Step(scene.mesh, scene.mesh.points, 1.0, 4, 0.002, True, 1e-8, Free(jnp.ones_like(scene.mesh.points)))
+    kinds = (replace(scene, solve=replace(scene.solve, kind=kind)) for kind in ("static", "dynamic"))
+    still, moving = (physics_of(each)[-1].freeze(None, step).dead for each in kinds)
+    assert np.array_equal(still, moving)
+    masses = density * nodal_volumes(scene.mesh)
+    whole = scene.mesh.number_of_vertices + (order > 1) * scene.mesh.pattern.edges.shape[1]
+    assert np.allclose(still[:whole].sum(axis=0), masses.sum() * GRAVITY, rtol=1e-13)
+    if order == 1 and mass == "lumped":
+        assert np.array_equal(still, masses[:, None] * GRAVITY[None])
 
 
 @pytest.mark.slow

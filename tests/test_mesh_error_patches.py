@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 
 import liverjax as lj
+from liverjax.elements import mjed, reference
+from liverjax.mesh.promotion import cubic
 from liverjax.physics.base import Free, Step
 from liverjax.physics.elastic_support import ElasticSupport
+from liverjax.physics.prescribed import free_places, prescribed
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.scenes.enriched import enriched
+from liverjax.scenes.refined import on_refined_mesh
 from liverjax.solvers import attached
 from liverjax.tensors.matrices import deformation_gradient, determinant
 
@@ -79,6 +83,95 @@ def test_a_foundation_of_order_3_has_the_derivatives_of_its_energy():
     found = jnp.stack(attached.product(springs.attached(rich, x, 1.0), tuple(jnp.asarray(v).T)), axis=1)
     exact = jax.jvp(lambda x: springs.force(rich, x, 1.0), (x,), (jnp.asarray(v),))[1]
     assert np.abs(found - exact).max() < 1e-12 * np.abs(exact).max()
+
+
+def _motions(scene: lj.Scene) -> tuple[np.ndarray, jax.Array]:
+    mesh, displaced = scene.mesh, scene.displaced
+    return free_places(mesh, scene.fixed, displaced), prescribed(mesh, displaced, 0.5, 1.0)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("richer", [enriched, lambda scene: on_refined_mesh(scene)[0]])
+def test_a_clamp_of_two_entries_is_a_clamp_of_one(order, richer):
+    """New nodes between two entries were free, and the estimated change of a force was 60 % larger."""
+    mesh = lj.shapes.box((0.1, 0.1, 0.1), (4, 2, 2))
+    mesh = lj.quadratic(mesh) if order == 2 else mesh
+    x, floor = np.asarray(mesh.points), np.asarray(mesh.node_sets["z_min"])
+    left, right = floor[x[floor, 0] <= 0.051], floor[x[floor, 0] > 0.051]
+    law = lj.laws.NeoHookean(mu=770.0, bulk=2200.0)
+
+    def moved(nodes: np.ndarray, by: np.ndarray, **more) -> lj.Displaced:
+        return lj.Displaced(nodes=jnp.asarray(nodes), by=jnp.asarray(by), **more)
+
+    clock = {"times": jnp.array([0.0, 1.0]), "history": jnp.array([0.0, 2.0])}
+    jump = np.where((x[floor, 0] > 0.051)[:, None], [0.0, 0.0, 1e-3], 0.0)
+    shifts = jnp.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2e-3]])
+    still = lj.Fixed(nodes=jnp.asarray(left))
+    later = lj.Displaced(nodes=jnp.asarray(right), times=clock["times"], history=shifts)
+    for one, two in (
+        ({"fixed": (lj.Fixed(nodes=floor),)}, {"fixed": (still, lj.Fixed(nodes=right))}),
+        ({"displaced": (moved(floor, 0.1 * x[floor]),)},
+         {"displaced": (moved(left, 0.1 * x[left]), moved(right, 0.1 * x[right]))}),
+        ({"displaced": (moved(floor, jump, **clock),)}, {"fixed": (still,), "displaced": (later,)}),
+    ):  # fmt: skip
+        (free, by), (own, own_by) = (_motions(richer(lj.Scene(mesh=mesh, law=law, **each))) for each in (one, two))
+        assert np.array_equal(free, own) and np.allclose(by, own_by, atol=1e-16)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("richer", [enriched, lambda scene: on_refined_mesh(scene)[0]])
+def test_a_clamp_of_two_entries_has_known_nodes_inside_jit(order, richer):
+    """The node numbers of the richer scene were unknown inside jit, which stopped with an error. There was one entry
+    for each axis, and some entries had no nodes.
+    """
+    mesh = lj.shapes.box((0.1, 0.1, 0.1), (4, 2, 2))
+    mesh = lj.quadratic(mesh) if order == 2 else mesh
+    x, floor = np.asarray(mesh.points), np.asarray(mesh.node_sets["z_min"])
+    fixed = tuple(lj.Fixed(nodes=floor[side]) for side in (x[floor, 0] <= 0.051, x[floor, 0] > 0.051))
+    corner = lj.Displaced(nodes=np.asarray(mesh.node_sets["z_max"])[:1], by=jnp.array([0.0, 0.0, 1e-3]))
+    found = []
+
+    def traced(mu: jax.Array) -> jax.Array:
+        law = lj.laws.NeoHookean(mu=mu, bulk=2200.0)
+        rich = richer(lj.Scene(mesh=mesh, law=law, fixed=fixed, displaced=(corner,)))
+        found.append([(entry.axes, np.asarray(entry.nodes)) for entry in rich.fixed])
+        return mu
+
+    traced(770.0)
+    jax.eval_shape(traced, 770.0)
+    outside, inside = found
+    assert len(outside) == len(inside) == 3 and outside[2][0] == "xyz"
+    assert all(a[0] == b[0] and np.array_equal(a[1], b[1]) for a, b in zip(outside, inside, strict=True))
+    assert all(len(nodes) for _, nodes in inside)
+
+
+def test_the_sides_between_two_clamps_stay_free():
+    mesh = lj.shapes.box((0.1, 0.1, 0.1), (2, 2, 1))
+    fixed = tuple(lj.Fixed(nodes=mesh.node_sets[name]) for name in ("z_min", "z_max"))
+    rich = enriched(lj.Scene(mesh=mesh, law=lj.laws.NeoHookean(mu=770.0, bulk=2200.0), fixed=fixed))
+    z = np.asarray(rich.mesh.points)[:, 2]
+    free, _ = _motions(rich)
+    assert np.array_equal(free.all(axis=1), (z > 0.01) & (z < 0.09))
+
+
+def test_one_density_per_node_keeps_float32():
+    """The densities of the functions of order 3 were in float64, and the estimate stopped with an error."""
+    mesh = jax.tree.map(lambda a: a.astype(jnp.float32) if a.dtype == jnp.float64 else a, MESH)
+    body = lj.Body(density=jnp.linspace(900.0, 1100.0, mesh.number_of_nodes, dtype=jnp.float32))
+    rich = enriched(lj.Scene(mesh=mesh, law=lj.laws.NeoHookean(mu=770.0, bulk=2200.0), body=body))
+    assert rich.body.density.dtype == jnp.float32 and rich.body.density.shape == (rich.mesh.number_of_nodes,)
+
+
+def test_stiffness_of_order_3_is_the_derivative_of_the_force():
+    """The signs of the functions on edges were missing."""
+    rich = cubic(lj.quadratic(lj.shapes.box((0.1, 0.1, 0.1), (1, 1, 1))))
+    law, rng = lj.laws.NeoHookean(mu=770.0, bulk=2200.0), np.random.default_rng(0)
+    x, v = (rich.points + jnp.asarray(1e-3 * rng.standard_normal(rich.points.shape)) for _ in range(2))
+    force, exact = jax.jvp(lambda x: mjed.internal_force(rich, law, x), (x,), (v,))
+    for K in (mjed.stiffness_matrix(rich, law, x), reference.stiffness_matrix(rich, law, x)):
+        assert np.abs(K @ np.ravel(v) - np.ravel(exact)).max() < 1e-12 * np.abs(exact).max()
+    for other in (reference.internal_force(rich, law, x), reference.standard_internal_force(rich, law, x)):
+        assert np.abs(other - force).max() < 1e-12 * np.abs(force).max()
 
 
 def test_pressure_on_a_closed_surface_of_order_3_is_the_change_of_volume():

@@ -217,6 +217,35 @@ def test_places_that_meet_at_an_edge_keep_their_size(order):
     assert set(np.asarray(fine.fixed[1].nodes)) == set(np.flatnonzero(np.abs(y[:, 1] - 0.5) < 1e-9))  # inside
 
 
+def test_free_midside_nodes_stay_free_on_the_refined_mesh():
+    """If only the vertices of a face had a motion, all new nodes of the face were prescribed, with wrong values."""
+    mesh = lj.quadratic(lj.shapes.box((1.0, 1.0, 1.0), (2, 2, 2)))
+    x, V = np.asarray(mesh.points), mesh.number_of_vertices
+    top = np.flatnonzero(x[:V, 2] > 0.99)
+    edge = np.flatnonzero((x[:, 2] < 0.01) & (x[:, 0] < 0.01))  # with the midside nodes
+    scene = lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=1.0, bulk=2.0),
+        fixed=(lj.Fixed(nodes=jnp.asarray(edge)),),
+        displaced=(lj.Displaced(nodes=jnp.asarray(top), by=jnp.tile(jnp.array([0.0, 0.0, -1e-3]), (len(top), 1))),),
+    )
+    fine = on_refined_mesh(scene)[0]
+    assert np.array_equal(fine.displaced[0].nodes, top) and np.all(fine.displaced[0].by[:, 2] == -1e-3)
+    y = np.asarray(fine.mesh.points)
+    assert set(np.asarray(fine.fixed[0].nodes)) == set(np.flatnonzero((y[:, 2] < 0.01) & (y[:, 0] < 0.01)))
+
+
+def test_node_sets_keep_their_midside_nodes_on_the_refined_mesh():
+    """A set of an edge of the body lost its midside nodes, because the edge is no face."""
+    mesh = lj.quadratic(lj.shapes.box((1.0, 1.0, 1.0), (2, 2, 2)))
+    x = np.asarray(mesh.points)
+    edge = np.flatnonzero((x[:, 2] < 0.01) & (x[:, 0] < 0.01))
+    mesh = replace(mesh, node_sets={"edge": edge})
+    assert len(edge) == 5 and np.array_equal(np.sort(refined(mesh).node_sets["edge"]), edge)
+    near = refined(mesh, near=edge)
+    assert np.allclose(np.asarray(near.points)[near.node_sets["edge"]], x[edge])
+
+
 def test_only_numbers_by_element_are_given_to_the_parts():
     """If there are as many triangles as elements, they were taken for values per element. The inflow was eight times
     too large.

@@ -157,13 +157,19 @@ def of_nodes(order: int, corners: jax.Array) -> jax.Array:
 
 
 def sparse(mesh: TetMesh, entries: np.ndarray) -> "scipy.sparse.csr_array":
-    """Assemble matrices (E, 9 n^2) of elements with n nodes into a matrix (3V, 3V). Row: 3 * node + component."""
+    """Assemble matrices (E, 9 n^2) of elements with n nodes into a matrix (3V, 3V). Row: 3 * node + component.
+
+    Rows and columns of functions of order 3 get the signs of these functions (`TetMesh.oriented`).
+    """
     import scipy.sparse  # imported here, since it takes a fifth of the package's import time
 
     nodes = mesh.element_nodes_on_host.T
     dofs = (3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1)
     rows, columns = np.repeat(dofs, dofs.shape[1], axis=1), np.tile(dofs, (1, dofs.shape[1]))
     n = 3 * mesh.number_of_nodes
+    if mesh.order == 3:
+        signs = np.repeat(mesh.oriented(jnp.ones((nodes.shape[1], 1, len(nodes))))[:, 0].T, 3, axis=1)
+        entries = signs[:, :, None] * np.reshape(entries, (*dofs.shape, -1)) * signs[:, None]
     return scipy.sparse.coo_array((np.ravel(entries), (rows.ravel(), columns.ravel())), shape=(n, n)).tocsr()
 
 

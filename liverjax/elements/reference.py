@@ -51,7 +51,7 @@ def _hessians(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
     def total(nodes):
         return jnp.sum(mesh.weights * mesh.at_points(law).energy(jnp.einsum("eai,...eaj->...eij", nodes, D)))
 
-    return derivative(jax.grad(total), x[jnp.stack(mesh.element_nodes, axis=1)])
+    return derivative(jax.grad(total), _element_values(mesh, x))
 
 
 def stiffness_matrix(mesh: TetMesh, law: Law, x: jax.Array) -> "scipy.sparse.csr_array":
@@ -70,7 +70,7 @@ def standard_internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
     B = _strain_displacement(F, _all_shape_vectors(mesh))
     share = jnp.einsum("...e,...evad,...ev->...ead", mesh.weights, B, _voigt(S))
     element = share.reshape(-1, *share.shape[-3:]).sum(axis=0)
-    return jnp.zeros_like(x).at[jnp.stack(mesh.element_nodes, axis=1)].add(element)
+    return jnp.zeros_like(x).at[jnp.stack(mesh.element_nodes, axis=1)].add(_with_signs(mesh, element))
 
 
 @jax.jit
@@ -106,8 +106,17 @@ def _all_shape_vectors(mesh: TetMesh) -> jax.Array:
 
 
 def _gradient(mesh: TetMesh, x: jax.Array) -> jax.Array:
-    nodes = x[jnp.stack(mesh.element_nodes, axis=1)]
-    return jnp.einsum("eai,...eaj->...eij", nodes, _all_shape_vectors(mesh))
+    return jnp.einsum("eai,...eaj->...eij", _element_values(mesh, x), _all_shape_vectors(mesh))
+
+
+def _element_values(mesh: TetMesh, x: jax.Array) -> jax.Array:
+    """Return the positions (E, n, 3) of the n nodes of every element, from the positions x (V, 3)."""
+    return _with_signs(mesh, x[jnp.stack(mesh.element_nodes, axis=1)])
+
+
+def _with_signs(mesh: TetMesh, values: jax.Array) -> jax.Array:
+    """Multiply values (E, n, 3) of n functions by the signs of the functions in each element."""
+    return jnp.transpose(mesh.oriented(jnp.transpose(values, (1, 2, 0))), (2, 0, 1))
 
 
 def _energy_of_C(law: Law, C: jax.Array) -> jax.Array:

@@ -108,8 +108,12 @@ def pattern(tetrahedra: Indices, points: jax.Array) -> Pattern:
 
 
 def node_numbers(of: Any) -> jax.Array:
-    """Return a copy of an array as 32-bit integers. NumPy makes the copy. JAX would compile a program per shape."""
-    return jax.device_put(np.asarray(of).astype(np.int32))
+    """Return a copy of an array as 32-bit integers. NumPy makes the copy. JAX would compile a program per shape.
+
+    The numbers are known inside jit, too.
+    """
+    with jax.ensure_compile_time_eval():
+        return jax.device_put(np.asarray(of).astype(np.int32))
 
 
 def patches(points: np.ndarray) -> np.ndarray:

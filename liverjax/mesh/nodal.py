@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax.core.struct import Number
 from liverjax.mesh.adjacency import PAIRS
 from liverjax.mesh.shape_functions import FACES, basis
 from liverjax.mesh.tetrahedra import TetMesh
@@ -72,23 +73,56 @@ _INTEGRALS = {1: (1 / 4,), 2: (-1 / 20, 1 / 5), 3: (-1 / 20, 1 / 5)}
 @partial(jax.jit, inline=True)
 def nodal_volumes(mesh: TetMesh) -> jax.Array:
     """Return lumped mass divided by density (V,) [m^3]. In linear elements, a vertex gets a quarter of the volume."""
-    return _weighted_parts(mesh, _LUMPED[min(mesh.order, 2)])
+    return _weighted_parts(mesh, _LUMPED[min(mesh.order, 2)], mesh.volumes)
 
 
 @partial(jax.jit, inline=True)
 def load_volumes(mesh: TetMesh) -> jax.Array:
     """Return the integrals of the shape functions (V,) [m^3]: the nodal forces [N] of a uniform weight of 1 N/m^3."""
-    total = _weighted_parts(mesh, _INTEGRALS[mesh.order])
+    return _shared_as_loads(mesh, mesh.volumes)
+
+
+def weighing_masses(mesh: TetMesh, density: Number, mass: str) -> jax.Array:
+    """Return the weight of the body at its nodes, divided by gravity (V,) [kg].
+
+    If a quadratic body or a body with consistent masses has one density per node, each element has one density
+    (`element_density`). So its total weight is its total mass times gravity, and a free body with linear elements or
+    with consistent masses falls without deformation.
+
+    Args:
+        density: one number, or one for each node (V,) [kg/m^3].
+        mass: lumped or consistent.
+    """
+    if jnp.ndim(density) and (mesh.order > 1 or mass == "consistent"):
+        return _shared_as_loads(mesh, element_density(mesh, jnp.asarray(density)) * mesh.volumes)
+    return density * load_volumes(mesh)
+
+
+def _shared_as_loads(mesh: TetMesh, size: jax.Array) -> jax.Array:
+    """Return the sums (V,) at the nodes if each element shares its number `size` (E,) like a uniform load."""
+    total = _weighted_parts(mesh, _INTEGRALS[mesh.order], size)
     if mesh.order < 3:
         return total
     bubbles = jnp.stack(mesh.element_nodes[-4:])
-    return given(total, bubbles, jnp.broadcast_to(9 / 40 * mesh.volumes, bubbles.shape))
+    return given(total, bubbles, jnp.broadcast_to(9 / 40 * size, bubbles.shape))
 
 
-def _weighted_parts(mesh: TetMesh, parts: tuple[float, ...]) -> jax.Array:
+def element_density(mesh: TetMesh, density: jax.Array) -> jax.Array:
+    """Return the density (E,) [kg/m^3] of every element: the lumped mass of its nodes, divided by its volume.
+
+    `density`: one number for each node (V,).
+    """
+    vertex, *middle = _LUMPED[min(mesh.order, 2)]
+    mean = jnp.mean(density[mesh.tetrahedra], axis=1)
+    if not middle:
+        return mean
+    return 4 * vertex * mean + middle[0] * jnp.sum(density[jnp.stack(mesh.element_nodes[4:10])], axis=0)
+
+
+def _weighted_parts(mesh: TetMesh, parts: tuple[float, ...], size: jax.Array) -> jax.Array:
     nodes = jnp.stack(mesh.element_nodes[: 4 if mesh.order == 1 else 10])
-    own = jnp.array([parts[a >= 4] for a in range(len(nodes))], mesh.volumes.dtype)
-    return given(jnp.zeros(mesh.number_of_nodes, mesh.volumes.dtype), nodes, own[:, None] * mesh.volumes[None])
+    own = jnp.array([parts[a >= 4] for a in range(len(nodes))], size.dtype)
+    return given(jnp.zeros(mesh.number_of_nodes, size.dtype), nodes, own[:, None] * size[None])
 
 
 @cache

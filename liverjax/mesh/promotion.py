@@ -94,6 +94,37 @@ def middles_of_places(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
     return V + np.unique(np.concatenate([_edges_of(mesh, outer).ravel(), _edges_of(mesh, inner).ravel()]))
 
 
+def middles_between(mesh: TetMesh, groups: list[np.ndarray]) -> np.ndarray:
+    """Return the node numbers (V + edge number) of the edge middles on surface triangles between groups of vertices.
+
+    Such a triangle has all its vertices in the groups, but not in one group. It continues a region of one group
+    (`middles_of_places`): it is nearly parallel to a neighbour in this region, or to a neighbour that continues it.
+    """
+    V = mesh.number_of_vertices
+    inside = np.zeros((len(groups), V), bool)
+    for own, nodes in zip(inside, groups, strict=True):
+        own[nodes[nodes < V]] = True
+    surface = boundary_triangles(mesh).astype(np.int64)
+    of_one = np.array([own[surface].all(axis=1) for own in inside])
+    of_any = np.asarray(inside.any(axis=0))
+    between = of_any[surface].all(axis=1) & ~of_one.any(axis=0)
+    if not between.any():
+        return np.zeros(0, np.int64)
+    for own, found in zip(inside, of_one, strict=True):
+        found[found] = _in_a_place(mesh, surface, own)
+    a, b = _pairs_at_edges(_edges_of(mesh, surface))
+    parallel = _nearly_parallel(mesh, surface, a, b)
+    a, b = a[parallel], b[parallel]
+    region = np.asarray(of_one.any(axis=0))
+    while True:
+        more = np.zeros(len(surface), bool)
+        more[a[region[b]]] = True
+        more &= between & ~region
+        if not more.any():
+            return V + np.unique(_edges_of(mesh, surface[region & between]))
+        region |= more
+
+
 def _and_neighbours(mesh: TetMesh, inside: np.ndarray) -> np.ndarray:
     """Return the mask `inside` (V,) of vertices, extended by all vertices that an edge connects with one of them."""
     low, high = np.asarray(mesh.pattern.edges)
@@ -117,13 +148,18 @@ def _in_a_place(mesh: TetMesh, surface: np.ndarray, inside: np.ndarray) -> np.nd
     inside, is nearly parallel to none of them, and is nearly parallel to a neighbour that is not inside.
     """
     own = inside[surface].all(axis=1)
-    normal = _normals(mesh, surface)
     a, b = _pairs_at_edges(_edges_of(mesh, surface))
-    parallel = np.sum(normal[a] * normal[b], axis=1) > _ONE_PLACE
+    parallel = _nearly_parallel(mesh, surface, a, b)
     number = np.arange(len(surface))
     continued, outside = (np.isin(number, a[parallel & which]) for which in (own[b], ~own[b]))
     alone = ~np.isin(number, a[own[b]])
     return (continued | ~outside | alone)[own]
+
+
+def _nearly_parallel(mesh: TetMesh, surface: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return a mask (m,) of the pairs of triangles a (m,) and b (m,) that are nearly parallel."""
+    normal = _normals(mesh, surface)
+    return np.asarray(np.sum(normal[a] * normal[b], axis=1) > _ONE_PLACE)
 
 
 def _normals(mesh: TetMesh, faces: np.ndarray) -> np.ndarray:
@@ -211,13 +247,14 @@ def with_functions(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
     edges = np.flatnonzero(inside[low] & inside[high] & inside[V : V + N])
     element = mesh.element_nodes_on_host[:10]
     faces = [
-        np.asarray(mesh.faces[k])[np.all([inside[element[n]] for n in _nodes_of_face(face)], axis=0)]
+        np.asarray(mesh.faces)[k][np.all([inside[element[n]] for n in nodes_of_face(face)], axis=0)]
         for k, face in enumerate(FACES)
     ]
     return np.concatenate([nodes, V + N + edges, V + 2 * N + np.unique(np.concatenate(faces))])
 
 
-def _nodes_of_face(face: tuple[int, ...]) -> list[int]:
+def nodes_of_face(face: tuple[int, ...]) -> list[int]:
+    """Return the local numbers of the six nodes of a face of a quadratic element."""
     return [*face, *(4 + k for k, pair in enumerate(PAIRS) if set(pair) <= set(face))]
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from liverjax.core.struct import Array, Indices, replace
 from liverjax.mesh.adjacency import PAIRS, node_numbers
-from liverjax.mesh.promotion import middles_of_set, quadratic
+from liverjax.mesh.promotion import middles_of_set, nodes_of_face, quadratic
 from liverjax.mesh.selection import boundary_triangles, check_nodes, face_codes
 from liverjax.mesh.shape_functions import FACES
 from liverjax.mesh.tetrahedra import FACES as OUTWARD
@@ -44,8 +44,9 @@ def refined(mesh: TetMesh, near: Indices | None = None) -> TetMesh:
     tets = _eighths(mesh, middle) if near is None else _bisected(mesh, middle)
     sets = {}
     for name, nodes in mesh.node_sets.items():
-        own = np.asarray(nodes)[np.asarray(nodes) < V]
-        new = middle[middles_of_set(mesh, name) - V]
+        nodes = np.asarray(nodes)
+        own, old_middles = nodes[nodes < V], nodes[(nodes >= V) & (nodes < V + len(low))]
+        new = middle[np.union1d(middles_of_set(mesh, name), old_middles) - V]
         sets[name] = np.concatenate([own, new[new >= 0]])
     elements = {} if near is not None else {name: parts_of(own) for name, own in mesh.element_sets.items()}
     stack = jnp.vstack if isinstance(points, jax.core.Tracer) else np.vstack
@@ -72,6 +73,26 @@ def quarters(mesh: TetMesh, triangles: Indices) -> jax.Array:
     return node_numbers(
         np.stack([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]).transpose(2, 0, 1).reshape(-1, 3)
     )
+
+
+def middles_of_whole_faces(mesh: TetMesh, fine: TetMesh, nodes: np.ndarray) -> np.ndarray:
+    """Return the new nodes of `fine` = `refined(mesh)` on the edges and faces that have all their nodes in `nodes`.
+
+    Both meshes are quadratic. An edge of `mesh` has three nodes, and a face has six nodes.
+    """
+    V, W = mesh.number_of_vertices, fine.number_of_vertices
+    inside = np.zeros(mesh.number_of_nodes, bool)
+    inside[nodes] = True
+    low, high = np.asarray(mesh.pattern.edges).astype(np.int64)
+    edge = np.flatnonzero(inside[low] & inside[high] & inside[V:])
+    own = mesh.element_nodes_on_host
+    faces = [own[list(face)][:, inside[own[nodes_of_face(face)]].all(axis=0)].T for face in FACES]
+    parts = np.asarray(quarters(mesh, np.concatenate(faces))).astype(np.int64)
+    ends = [np.stack([end[edge], V + edge], axis=1) for end in (low, high)]
+    ends += [parts[:, side] for side in ([0, 1], [1, 2], [2, 0])]
+    pairs = np.sort(np.concatenate(ends), axis=1)
+    first, second = np.asarray(fine.pattern.edges).astype(np.int64)
+    return W + np.flatnonzero(np.isin(first * W + second, pairs[:, 0] * W + pairs[:, 1]))
 
 
 def places_in(mesh: TetMesh, fine: TetMesh) -> tuple[np.ndarray, np.ndarray]:

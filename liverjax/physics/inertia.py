@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core.struct import Number, param, static, struct
-from liverjax.mesh.nodal import mass_parts, nodal_volumes
+from liverjax.mesh.nodal import element_density, mass_parts, nodal_volumes
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End, Free, NodalForce, Physics, Start, Step, diagonal
 from liverjax.solvers import attached
@@ -79,11 +79,12 @@ class Inertia(Physics):
         """Return the diagonal masses (V,) [kg] of the nodes, and the remaining part of the consistent mass matrix.
 
         The remaining part is the consistent mass matrix minus the diagonal masses. It is None if the mass is lumped.
+        With one density per node, the consistent masses of an element have one density (`element_density`).
         """
         if self.mass == "lumped":
             return self.density * nodal_volumes(mesh), None
         density, (parts, matrix) = jnp.asarray(self.density), mass_parts(mesh.order)
-        size = mesh.volumes * (density if density.ndim == 0 else jnp.mean(density[mesh.tetrahedra], axis=1))
+        size = mesh.volumes * (density if density.ndim == 0 else element_density(mesh, density))
         shares = jnp.asarray(parts, size.dtype)[:, None] * size[None]
         mass = given(jnp.zeros(mesh.number_of_nodes, size.dtype), jnp.stack(mesh.element_nodes), shares)
         return mass, masses(mesh, matrix, size)

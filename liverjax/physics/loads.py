@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from liverjax.core import history
 from liverjax.core.struct import Indices, Number, Numbers, param, replace, static, struct
 from liverjax.mesh import surface
-from liverjax.mesh.nodal import load_volumes
+from liverjax.mesh.nodal import weighing_masses
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import NodalForce, Physics, Step
 
@@ -77,14 +77,15 @@ def follower_forces(tractions: tuple, x: jax.Array, mesh: TetMesh | None = None)
     return force
 
 
-def dead_loads(mesh: TetMesh, density: Number, gravity: Numbers, tractions: tuple) -> jax.Array:
-    """Return the nodal forces (V, 3) [N] of the dead loads: tractions, and the weight if `density` is not None."""
+def dead_loads(mesh: TetMesh, density: Number, gravity: Numbers, tractions: tuple, mass: str) -> jax.Array:
+    """Return the nodal forces (V, 3) [N] of the dead loads: tractions, and the weight if `density` is not None.
+
+    `mass` is the kind of masses of the body, lumped or consistent (`weighing_masses`).
+    """
     force = jnp.zeros(mesh.points.shape, mesh.points.dtype)
     if density is not None:
-        # The density at a node multiplies the volume that belongs to this node. In quadratic elements, this volume is
-        # negative for a vertex.
-        mass = density * load_volumes(mesh)
-        force = force + mass[:, None] * jnp.asarray(gravity, force.dtype)[None]
+        masses = weighing_masses(mesh, density, mass)
+        force = force + masses[:, None] * jnp.asarray(gravity, force.dtype)[None]
     return force + nodal_tractions(mesh, tractions) if tractions else force
 
 
@@ -99,6 +100,7 @@ class Loads(Physics):
         "1", "factors (T,) that multiply gravity, or gravity itself (T, 3) [m/s^2]", default=None
     )
     traction: tuple[Traction, ...] = param("1", "on the surface", default=())
+    mass: str = static(default="lumped", about="masses of the same body: lumped or consistent")
 
     def freeze(self, memory: None, step: Step) -> "Loading":
         """Return the force term of the loads for one step. It stores the sum of all dead loads."""
@@ -114,7 +116,7 @@ class Loads(Physics):
         return replace(self, gravity=gravity, traction=traction, times=None, history=None)
 
     def _loading(self, step: Step, growth: str) -> "Loading":
-        dead = dead_loads(step.mesh, self.density, self.gravity, self.traction)
+        dead = dead_loads(step.mesh, self.density, self.gravity, self.traction, self.mass)
         return Loading(dead=dead, traction=self.traction, k=step.k, steps=step.steps, growth=growth)
 
 

@@ -61,7 +61,7 @@ def physics_of(scene: Any) -> tuple[Physics, ...]:
     if body is not None and scene.solve.kind == "dynamic":
         found.append(Inertia(density=body.density, integrator=scene.solve.integrator, mass=body.mass))
     if body is not None or scene.traction:
-        keys = ("density", "gravity", "times", "history")
+        keys = ("density", "gravity", "times", "history", "mass")
         weight = {} if body is None else {key: getattr(body, key) for key in keys}
         found.append(Loads(traction=scene.traction, **weight))
     return (*found, *(p.in_body(scene.mesh, unrelaxed) for p in scene.physics))

@@ -82,12 +82,12 @@ def _given(model: ReducedModel, scene: Scene) -> tuple[_Given, jax.Array]:
     """Return the reduced loads and the prescribed motion of all steps. The second result is the reduced load (n,)
     [N m^-1.5] on the n modes at the beginning of the run."""
     mesh, solve, body = scene.mesh, scene.solve, scene.body
-    weight = {} if body is None else {k: getattr(body, k) for k in ("density", "gravity", "times", "history")}
+    weight = {} if body is None else {k: getattr(body, k) for k in ("density", "gravity", "times", "history", "mass")}
     loads = Loads(traction=scene.traction, **weight)
     numbers = jnp.arange(solve.steps + 1, dtype=mesh.points.dtype)
 
     def reduced(at: Loads) -> jax.Array:
-        dead = dead_loads(mesh, at.density, at.gravity, at.traction)
+        dead = dead_loads(mesh, at.density, at.gravity, at.traction, at.mass)
         return jnp.tensordot(model.modes, dead, axes=2)
 
     if loads.history is not None or any(load.history is not None for load in loads.traction):

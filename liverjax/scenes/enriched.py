@@ -3,6 +3,8 @@
 Supports, motions and loads do not change. The position and the values of a new node follow from the nodes around it.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,9 +12,11 @@ import numpy as np
 from liverjax.core.struct import Indices, replace
 from liverjax.mesh import promotion
 from liverjax.mesh.adjacency import node_numbers
+from liverjax.mesh.nodal import element_density
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.loads import Traction
 from liverjax.physics.prescribed import Displaced, Fixed
+from liverjax.scenes.between_entries import joined_entries
 from liverjax.scenes.scene import Scene
 
 
@@ -30,13 +34,16 @@ def _quadratic_mesh(scene: Scene) -> Scene:
     body = scene.body
     if body is not None and jnp.ndim(body.density):
         body = replace(body, density=promotion.on_middles(mesh, jnp.asarray(body.density)))
-    return replace(
+    made = replace(
         scene,
         mesh=mesh,
         body=body,
         fixed=tuple(replace(f, nodes=more(f.nodes)) for f in scene.fixed),
         displaced=tuple(_between(mesh, d, more(d.nodes)) for d in scene.displaced),
         physics=tuple(p.enriched(mesh, more) for p in scene.physics),
+    )
+    return joined_entries(
+        scene, made, partial(promotion.middles_between, scene.mesh), partial(promotion.on_middles, mesh)
     )
 
 
@@ -56,11 +63,12 @@ def _cubic(scene: Scene) -> Scene:
 
     # The unknowns of the new shape functions are not positions. Where a motion is prescribed, these unknowns are fixed
     # at 0.
-    still = tuple(Fixed(nodes=more(d.nodes)[len(np.asarray(d.nodes)) :], axes=d.axes) for d in scene.displaced)
+    added = [(promotion.with_functions(mesh, np.asarray(d.nodes))[len(d.nodes) :], d.axes) for d in scene.displaced]
+    still = tuple(Fixed(nodes=node_numbers(nodes), axes=axes) for nodes, axes in added if len(nodes))
     body = scene.body
     if body is not None and jnp.ndim(body.density):
         body = replace(body, density=_of_new_functions(mesh, jnp.asarray(body.density)))
-    return replace(
+    made = replace(
         scene,
         mesh=mesh,
         body=body,
@@ -69,12 +77,21 @@ def _cubic(scene: Scene) -> Scene:
         physics=tuple(p.enriched(mesh, more) for p in scene.physics),
     )
 
+    def between(groups: list[np.ndarray]) -> np.ndarray:
+        whole = np.unique(np.concatenate(groups))
+        return promotion.with_functions(mesh, whole)[len(whole) :]
+
+    def field(values: jax.Array) -> jax.Array:
+        return jnp.pad(values, (0, mesh.number_of_nodes - len(values)))
+
+    return joined_entries(scene, made, between, field)
+
 
 def _of_new_functions(mesh: TetMesh, density: jax.Array) -> jax.Array:
     """Return the density for all shape functions. A new function gets the mean density of its elements."""
     nodes = jnp.stack(mesh.element_nodes)
-    own = jnp.broadcast_to(jnp.mean(density[mesh.tetrahedra], axis=1), nodes.shape)
-    total, count = (jnp.zeros(mesh.number_of_nodes).at[nodes].add(each) for each in (own, 1.0))
+    own = jnp.broadcast_to(element_density(mesh, density), nodes.shape)
+    total, count = (jnp.zeros(mesh.number_of_nodes, own.dtype).at[nodes].add(each) for each in (own, 1.0))
     return jnp.concatenate([density, (total / count)[len(density) :]])
 
 

@@ -19,14 +19,15 @@ from liverjax.laws import Law
 from liverjax.laws.by_region import ByRegion
 from liverjax.mesh.adjacency import node_numbers
 from liverjax.mesh.locate import weights
-from liverjax.mesh.promotion import middles_of_places
-from liverjax.mesh.refinement import parts_of, places_in, quarters, refined
+from liverjax.mesh.promotion import middles_between, middles_of_places
+from liverjax.mesh.refinement import middles_of_whole_faces, parts_of, places_in, quarters, refined
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.attached.vessel import Vessel
 from liverjax.physics.base import Physics
 from liverjax.physics.porosity import Porosity
 from liverjax.physics.prescribed import Displaced
 from liverjax.physics.viscosity import Prony
+from liverjax.scenes.between_entries import joined_entries
 from liverjax.scenes.regions import POROUS, VISCOUS
 from liverjax.scenes.scene import Scene
 from liverjax.tensors.subsets import subsets
@@ -91,6 +92,9 @@ def on_refined_mesh(scene: Scene) -> tuple[Scene, Within]:
     mesh, within = _mesh_and_within(old)
 
     def more(nodes: Indices) -> jax.Array:
+        return node_numbers(np.concatenate([nodes, _between_nodes(old, mesh, np.asarray(nodes))]))
+
+    def more_pressures(nodes: Indices) -> jax.Array:
         return node_numbers(_with_nodes_between(old, mesh, np.asarray(nodes)))
 
     def parts(load: T) -> T:
@@ -103,19 +107,20 @@ def on_refined_mesh(scene: Scene) -> tuple[Scene, Within]:
     body = scene.body
     if body is not None and jnp.ndim(body.density):
         body = replace(body, density=within.field(jnp.asarray(body.density)))
-    return replace(
+    made = replace(
         scene,
         mesh=mesh,
         law=_law_of_parts(E, scene.law),
         viscosity=_series(scene.viscosity),
         region=tuple(replace(r, elements=node_numbers(parts_of(r.elements))) for r in scene.region),
-        porosity=_sponge(E, scene.porosity, more, parts),
+        porosity=_sponge(E, scene.porosity, more_pressures, parts),
         body=body,
         fixed=tuple(replace(f, nodes=more(f.nodes)) for f in scene.fixed),
         displaced=tuple(_moved_in_between(within, d, more(d.nodes), old.number_of_nodes) for d in scene.displaced),
         traction=tuple(map(parts, scene.traction)),
         physics=tuple(map(attached, scene.physics)),
-    ), within
+    )
+    return joined_entries(scene, made, partial(_between_groups, old, mesh), within.field), within
 
 
 def _mesh_and_within(old: TetMesh) -> tuple[TetMesh, Within]:
@@ -135,11 +140,28 @@ def _mesh_and_within(old: TetMesh) -> tuple[TetMesh, Within]:
 
 def _with_nodes_between(old: TetMesh, mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
     """Return the node numbers `nodes`, and the numbers of the new nodes that lie between them (see
-    `middles_of_places`)."""
+    `middles_of_places`). This is for pressures, which are linear along the edges of linear and quadratic elements."""
     found = np.concatenate([nodes, np.setdiff1d(middles_of_places(old, nodes), nodes)])
     if mesh.order == 1:
         return found
     return np.concatenate([found, np.setdiff1d(middles_of_places(mesh, found), found)])
+
+
+def _between_nodes(old: TetMesh, mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
+    """Return the new nodes whose motion the motion of the old nodes `nodes` prescribes.
+
+    With linear elements, see `middles_of_places`. With quadratic elements, see `middles_of_whole_faces`.
+    """
+    if mesh.order == 1:
+        return np.setdiff1d(middles_of_places(old, nodes), nodes)
+    return middles_of_whole_faces(old, mesh, nodes)
+
+
+def _between_groups(old: TetMesh, mesh: TetMesh, groups: list[np.ndarray]) -> np.ndarray:
+    """Return the new nodes whose motion several groups of old nodes prescribe together."""
+    if mesh.order == 1:
+        return middles_between(old, groups)
+    return middles_of_whole_faces(old, mesh, np.concatenate(groups))
 
 
 def _of_parts(E: int, numbers: T) -> T:

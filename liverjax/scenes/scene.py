@@ -32,7 +32,10 @@ HIGHEST_HZ = 1e9
 class Body:
     """Mass and weight of the body.
 
-    In linear elements, the lumped mass of a node is its density times a quarter of the volume of its elements.
+    In linear elements, the lumped mass of a node is its density times a quarter of the volume of its elements. With
+    consistent masses and one density per node, each element has one density: its lumped mass divided by its volume. The
+    weight belongs to the same masses, also in static runs. In quadratic elements with lumped masses, only the total
+    weight does.
     """
 
     density: Number = param(

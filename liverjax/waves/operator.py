@@ -22,7 +22,7 @@ from liverjax.core.struct import Number
 from liverjax.elements import mjed
 from liverjax.laws.base import Law, volumetric_part
 from liverjax.laws.terms import invariant_terms
-from liverjax.mesh.nodal import nodal_volumes, products
+from liverjax.mesh.nodal import element_density, nodal_volumes, products
 from liverjax.mesh.shape_functions import basis
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics import viscosity
@@ -141,7 +141,7 @@ def _stacked(K: Matrix) -> jax.Array:
 def _mass(mesh: TetMesh, density: jax.Array, kind: str) -> jax.Array:
     if kind == "lumped":
         return density * nodal_volumes(mesh)
-    own = density if density.ndim == 0 else jnp.mean(density[mesh.tetrahedra], axis=1)
+    own = density if density.ndim == 0 else element_density(mesh, density)
     M = jnp.asarray(products(mesh.order), mesh.points.dtype)[:, :, None] * (own * mesh.volumes)[None, None]
     return _both_ways(mesh, M)
 

@@ -7,7 +7,7 @@ elements of another card.
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -31,6 +31,10 @@ _CELLS = {
 _FACES = {"S1": (0, 2, 1), "S2": (0, 1, 3), "S3": (1, 2, 3), "S4": (0, 3, 2)}
 #: Keywords that create nodes or elements, or that change coordinates.
 _MAKING = ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM")
+
+
+#: Place of a set: True if it belongs to the part, and its name in small letters.
+_Place = tuple[bool, str]
 
 
 class _Card(NamedTuple):
@@ -65,10 +69,12 @@ def read_abaqus(path: Path) -> "meshio.Mesh":
         blocks = {k: _read_block(card, nodes) for k, card in enumerate(cards) if _kind_of_cells(card) is not None}
         elements = [label for block in blocks.values() for label in block.labels]
         _check_unique(elements, "elements")
-        element_sets = _sets(cards, "ELSET", {k: block.labels for k, block in blocks.items()}, {})
+        element_members = _members(cards, "ELSET", {k: block.labels for k, block in blocks.items()}, {})
+        element_sets = _sets_by_name(cards, "ELSET", element_members)
         by_card = {k: [int(line[0]) for line in card.lines] for k, card in _cards_of(cards, "NODE")}
-        node_sets = _sets(cards, "NSET", by_card, _nodes_of(element_sets, blocks, list(nodes)))
-        surfaces = _surfaces(cards, element_sets, blocks)
+        of_elements = _nodes_of(element_members, blocks, list(nodes))
+        node_sets = _sets_by_name(cards, "NSET", _members(cards, "NSET", by_card, of_elements))
+        surfaces = _surfaces(cards, element_members, blocks)
     except _Wrong as error:
         raise InputError(f"mesh file {path}: {error}") from None
     none = [np.zeros(0, int)] * len(surfaces)
@@ -212,73 +218,88 @@ def _read_block(card: _Card, nodes: dict[int, int]) -> _Block:
     return _Block(kind, rows[:, 0].tolist(), np.array(places, int).reshape(-1, size))
 
 
-def _sets(
-    cards: list[_Card], key: str, by_card: dict[int, list[int]], of_elements: dict[str, set[int]]
-) -> dict[str, set[int]]:
-    """Return {name of a set: numbers of its members}. In names of sets, Abaqus ignores the case of letters.
+def _cards_of_sets(cards: list[_Card], key: str) -> dict[_Place, list[int]]:
+    """Return {place of a set: indices of its cards}. `key`: "NSET" or "ELSET"."""
+    making = {"NSET": "NODE", "ELSET": "ELEMENT"}[key]
+    found: dict[_Place, list[int]] = {}
+    for k, card in enumerate(cards):
+        if key in card.parameters and card.keyword in (key, making):
+            found.setdefault((card.inside, card.parameters[key].lower()), []).append(k)
+    return found
+
+
+def _place_of(name: str, inside: bool, places: Iterable[_Place], where: str) -> _Place:
+    """Return the place of the set that a card names. `inside`: whether the card belongs to the part."""
+    small = name.lower()
+    last = small.rpartition(".")[2]  # the name of the part or of the assembly may stand before the name of the set
+    candidates = ((inside, small), (True, small), (True, last), (False, small), (False, last))
+    at = next((place for place in candidates if place in places), None)
+    if at is None:
+        raise _Wrong(f"*{where} contains {name}, but the file does not define this set; define it")
+    return at
+
+
+def _members(
+    cards: list[_Card], key: str, by_card: dict[int, list[int]], of_elements: dict[_Place, set[int]]
+) -> dict[_Place, set[int]]:
+    """Return {place of a set: numbers of its members}. In names of sets, Abaqus ignores the case of letters.
 
     Args:
         cards: cards of the file.
         key: "NSET" or "ELSET".
         by_card: {index of a card: numbers of the nodes or elements that this card defines}.
-        of_elements: {name of a set of elements: numbers of their nodes}.
+        of_elements: {place of a set of elements: numbers of their nodes}.
     """
-    making = {"NSET": "NODE", "ELSET": "ELEMENT"}[key]
-    names: dict[str, str] = {}  # names in small letters -> names as the file first writes them
-    found: dict[tuple[bool, str], list[int]] = {}  # (whether the set belongs to the part, name) -> its cards
-    for k, card in enumerate(cards):
-        if key in card.parameters and card.keyword in (key, making):
-            name = card.parameters[key].lower()
-            names.setdefault(name, card.parameters[key])
-            found.setdefault((card.inside, name), []).append(k)
+    found = _cards_of_sets(cards, key)
 
-    def members(own: tuple[bool, str], outer: tuple[tuple[bool, str], ...]) -> set[int]:
+    def members(own: _Place, outer: tuple[_Place, ...]) -> set[int]:
         together: set[int] = set()
         for k in () if own in outer else found[own]:
             numbers, others = _listed(cards[k], of_elements) if cards[k].keyword == key else (by_card.get(k, ()), ())
             together.update(numbers)
             for other in others:
-                last = other.rpartition(".")[2]  # the name of the part may stand before the name of the set
-                places = ((own[0], other), (True, other), (True, last))
-                at = next((place for place in places if place in found), None)
-                if at is None:
-                    raise _Wrong(f"*{key} contains {other}, but the file does not define this set; define it")
-                together |= members(at, (*outer, own))
+                together |= members(_place_of(other, own[0], found, key), (*outer, own))
         return together
 
+    return {place: members(place, ()) for place in found}
+
+
+def _sets_by_name(cards: list[_Card], key: str, members: dict[_Place, set[int]]) -> dict[str, set[int]]:
+    """Return {name of a set: numbers of its members}. A name is written as the file first writes it."""
+    names: dict[str, str] = {}
+    for (_, name), own in _cards_of_sets(cards, key).items():
+        names.setdefault(name, cards[own[0]].parameters[key])
     part = next((card.parameters.get("NAME", "part") for _, card in _cards_of(cards, "PART")), "")
     return {
-        f"{part}.{names[name]}" if inside and (False, name) in found else names[name]: members((inside, name), ())
-        for inside, name in found
+        f"{part}.{names[name]}" if inside and (False, name) in members else names[name]: own
+        for (inside, name), own in members.items()
     }
 
 
 def _surfaces(
-    cards: list[_Card], element_sets: dict[str, set[int]], blocks: dict[int, _Block]
+    cards: list[_Card], element_sets: dict[_Place, set[int]], blocks: dict[int, _Block]
 ) -> dict[str, np.ndarray]:
     """Return {name of a ``*SURFACE`` card: corners (m, 3) of its triangles}. A data line contains an element, or a set
     of elements, and one of `_FACES`. Other surfaces (of nodes or shells, or analytical surfaces) are ignored."""
     tetrahedra = [block for block in blocks.values() if block.kind in ("tetra", "tetra10")]
     corners = {k: own[:4] for block in tetrahedra for k, own in zip(block.labels, block.nodes, strict=True)}
-    sets = {key: own for name, own in element_sets.items() for key in (name.lower(), name.rpartition(".")[2].lower())}
     found: dict[str, list[np.ndarray]] = {}
     for _, card in _cards_of(cards, "SURFACE"):
         for line in card.lines if card.parameters.get("TYPE", "ELEMENT").upper() == "ELEMENT" else ():
-            of, face = line[0].lower(), line[1].upper() if len(line) > 1 else ""
-            last = of.rpartition(".")[2]  # the name of the part may stand before the number or the name
-            members = {int(last)} if last.isdigit() else sets.get(of, sets.get(last))
-            if members is None:
-                raise _Wrong(f"*SURFACE contains {line[0]}, but the file does not define this set; define it")
+            of, face = line[0], line[1].upper() if len(line) > 1 else ""
+            last = of.rpartition(".")[2]  # the name of the part may stand before the number
+            place = None if last.isdigit() else _place_of(of, card.inside, element_sets, "SURFACE")
+            members = {int(last)} if place is None else element_sets[place]
             if face in _FACES:
                 own = [corners[k][list(_FACES[face])] for k in sorted(members & corners.keys())]
                 found.setdefault(card.parameters.get("NAME", "surface"), []).extend(own)
     return {name: np.array(own) for name, own in found.items() if own}
 
 
-def _listed(card: _Card, of_elements: dict[str, set[int]]) -> tuple[set[int], list[str]]:
+def _listed(card: _Card, of_elements: dict[_Place, set[int]]) -> tuple[set[int], list[str]]:
     """Return the numbers, and the names of other sets (in small letters), that a card of a set contains."""
     if card.keyword == "NSET" and "ELSET" in card.parameters:
-        return of_elements.get(card.parameters["ELSET"].lower(), set()), []
+        return of_elements[_place_of(card.parameters["ELSET"], card.inside, of_elements, "NSET")], []
     numbers, others = set(), []
     # In the assembly, numbers without the name of an instance belong to reference points.
     of_part = card.inside or "INSTANCE" in card.parameters
@@ -296,12 +317,14 @@ def _listed(card: _Card, of_elements: dict[str, set[int]]) -> tuple[set[int], li
     return numbers, others
 
 
-def _nodes_of(element_sets: dict[str, set[int]], blocks: dict[int, _Block], labels: list[int]) -> dict[str, set[int]]:
-    """Return {name of a set of elements in small letters: numbers of the nodes of its elements}."""
+def _nodes_of(
+    element_sets: dict[_Place, set[int]], blocks: dict[int, _Block], labels: list[int]
+) -> dict[_Place, set[int]]:
+    """Return {place of a set of elements: numbers of the nodes of its elements}."""
     every = {own: nodes for block in blocks.values() for own, nodes in zip(block.labels, block.nodes, strict=True)}
     return {
-        name.lower(): {labels[node] for own in members & every.keys() for node in every[own].tolist()}
-        for name, members in element_sets.items()
+        place: {labels[node] for own in members & every.keys() for node in every[own].tolist()}
+        for place, members in element_sets.items()
     }
 
 

@@ -1,0 +1,114 @@
+"""Supports and motions of the new nodes between two entries, for example between two `[[fixed]]` entries of one clamp.
+
+Each entry of a scene gets the new nodes between its own nodes. On a strip of triangles between two entries, the run
+prescribes the motion of all nodes. So the new nodes on this strip move as these triangles do in the run.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core.struct import replace
+from liverjax.mesh.adjacency import node_numbers
+from liverjax.mesh.selection import AXES
+from liverjax.physics.prescribed import Displaced, Fixed
+from liverjax.scenes.scene import Scene
+
+#: Weights of old nodes at a new node are roundoff if they are below this value.
+_SOME_WEIGHT = 1e-9
+
+
+def joined_entries(
+    old: Scene,
+    made: Scene,
+    between: Callable[[list[np.ndarray]], np.ndarray],
+    field: Callable[[jax.Array], jax.Array],
+) -> Scene:
+    """Return the scene `made` with additional entries for the new nodes between the entries of the scene `old`.
+
+    A new node between two motions with different histories stays free. If the positions of the mesh are unknown
+    (inside jit, grad or vmap), no entry is added.
+
+    Args:
+        old, made: the scene before and after the conversion.
+        between: function of the old nodes of several entries -> the new nodes on the regions that they form together.
+        field: function of the values (V,) at the old nodes -> the values (V',) at the new nodes.
+    """
+    if isinstance(old.mesh.points, jax.core.Tracer):
+        return made
+    still, displaced = dict[tuple[int, ...], str](), made.displaced  # still: nodes that stay, and their axes
+    for axis in AXES:
+        own = _entries_along(old, axis)
+        if len(own) < 2:
+            continue
+        held = [np.asarray(entry.nodes) for entry in _entries_along(made, axis)]
+        new = np.setdiff1d(between([np.asarray(entry.nodes) for entry in own]), np.concatenate(held))
+        if not len(new):
+            continue
+        owner = np.full(old.mesh.number_of_nodes, -1)
+        for k, entry in enumerate(own):
+            owner[np.asarray(entry.nodes)] = k
+        clocks, alike = _clocks(own)
+        with jax.ensure_compile_time_eval():
+            masks = [np.asarray(field(jnp.asarray(owner == k, float))) for k in range(len(own))]
+        near = np.array([np.abs(mask[new]) > _SOME_WEIGHT for mask in masks])
+        moved = np.array([near[clocks == c].any(axis=0) for c in range(len(alike))]).reshape(len(alike), len(new))
+        staying = tuple(new[~moved.any(axis=0)].tolist())
+        if staying:
+            still[staying] = still.get(staying, "") + axis
+        for c, first in enumerate(alike):
+            nodes = new[moved[c] & (moved.sum(axis=0) == 1)]
+            if len(nodes):
+                parts = [(e, owner == k) for k, e in enumerate(own) if isinstance(e, Displaced) and clocks[k] == c]
+                by = field(sum((_amounts(e, axis, where) for e, where in parts), jnp.zeros(len(owner))))[nodes]
+                displaced = (*displaced, _along_axis(first, axis, nodes, by.astype(old.mesh.points.dtype)))
+    fixed = (Fixed(nodes=node_numbers(nodes), axes=axes) for nodes, axes in still.items())
+    return replace(made, fixed=(*made.fixed, *fixed), displaced=displaced)
+
+
+def _entries_along(scene: Scene, axis: str) -> list[Fixed | Displaced]:
+    entries: tuple[Fixed | Displaced, ...] = (*scene.fixed, *scene.displaced)
+    return [entry for entry in entries if axis in entry.axes]
+
+
+def _clocks(own: list[Fixed | Displaced]) -> tuple[np.ndarray, list[Displaced]]:
+    """Return a number for each entry, and one entry for each number. Entries with equal numbers have equal histories.
+
+    The number of a fixed entry is -1.
+    """
+    clocks, alike = np.full(len(own), -1), list[Displaced]()
+    for k, entry in enumerate(own):
+        if isinstance(entry, Displaced):
+            same = [c for c, other in enumerate(alike) if _same(entry.times, other.times)]
+            same = [c for c in same if _same(entry.history, alike[c].history)]
+            clocks[k] = same[0] if same else len(alike)
+            alike += [] if same else [entry]
+    return clocks, alike
+
+
+def _same(a: object, b: object) -> bool:
+    if a is None or b is None or isinstance(a, jax.core.Tracer) or isinstance(b, jax.core.Tracer):
+        return a is b
+    return np.array_equal(np.asarray(a), np.asarray(b))
+
+
+def _amounts(entry: Displaced, axis: str, where: np.ndarray) -> jax.Array:
+    """Return the displacement [m] along an axis at the nodes of the mask `where` (V,), and 0 at other nodes.
+
+    If the history contains the displacements, the result is the factor 1 of this history.
+    """
+    values = jnp.ones(()) if entry.by is None else jnp.asarray(entry.by)[..., AXES.index(axis)]
+    nodes = np.asarray(entry.nodes)
+    return jnp.where(where, jnp.zeros(len(where), values.dtype).at[nodes].set(values), 0.0)
+
+
+def _along_axis(entry: Displaced, axis: str, nodes: np.ndarray, by: jax.Array) -> Displaced:
+    """Return a motion of n nodes along one axis with the history of an entry. `by` (n,): see `_amounts`."""
+    k = AXES.index(axis)
+    history = entry.history
+    if entry.by is None and history is not None:
+        history = jnp.asarray(history)[:, k]
+    by = jnp.zeros((len(nodes), 3), by.dtype).at[:, k].set(by)
+    return replace(entry, nodes=node_numbers(nodes), by=by, history=history, axes=axis)
