@@ -452,3 +452,20 @@ def test_a_number_that_the_other_points_do_not_determine_is_unknown_by_its_own_s
     share = total_error.error_shares(fit)["band"]["shear_modulus"]
     assert share == pytest.approx(max(fit.model.shear_modulus, edges.values(fit)["shear_modulus"][1]), rel=1e-9)
     assert "shear_modulus by more than tenfold" in edges._moved_most(fit)[0]
+
+
+def test_noise_with_one_size_in_pascal_has_its_own_errors():
+    """The torque has a low resolution. This noise was taken for a percentage of each modulus."""
+    omega, times, ratios = 2 * np.pi * np.geomspace(0.01, 31.6, 22), np.array([0.1, 3.0]), np.array([0.4, 0.3])
+    model = generalised_maxwell.Maxwell(np.float64(1000.0), ratios, times)
+    storage, loss = map(np.asarray, generalised_maxwell.moduli(model, omega))
+    shown = []
+    for seed in range(12):
+        noise = np.random.default_rng(seed).standard_normal((2, 22))
+        for size, relative in ((6.0, 0.0), (0.0, 0.02)):
+            s = Sweep(omega, storage * (1 + relative * noise[0]) + size * noise[0], loss * (1 + relative * noise[1]))
+            s = s._replace(loss=np.maximum(s.loss + size * noise[1], 1.0))
+            fit = viscoelastic.closed_form(s, 2)
+            shown.append((size > 0, fit.noise_root is not None))
+    assert np.mean([found for constant, found in shown if constant]) > 0.6
+    assert not any(found for constant, found in shown if not constant)

@@ -144,22 +144,6 @@ def test_other_noise_is_weighed_as_before():
     assert weighed_by_scatter(s) is s
 
 
-def test_noise_of_one_size_has_its_own_weights_and_errors():
-    """The torque has a low resolution. This noise was taken for a percentage of each modulus."""
-    G, found, shown = modulus(np.array([0.3, 0.4]), np.array([10.0, 0.3])), 0, 0
-    for seed in range(20):
-        noise = 0.01 * G.real.mean() * np.random.default_rng(seed).standard_normal((2, len(OMEGA)))
-        s = Sweep(OMEGA, G.real + noise[0], np.maximum(G.imag + noise[1], 1.0))
-        own = weighed_by_scatter(s)
-        found += any("Pa at all frequencies" in note for note in own.notes)
-        fit = viscoelastic.closed_form(own, 2)
-        shown += own.sd_estimated or fit.noise_root is not None
-    assert found >= 5 and shown >= 14
-    relative = [np.random.default_rng(seed).standard_normal((2, len(OMEGA))) for seed in range(20)]
-    sweeps = [Sweep(OMEGA, G.real * (1 + 0.02 * a), G.imag * (1 + 0.02 * b)) for a, b in relative]
-    assert not any("Pa at all frequencies" in note for s in sweeps for note in weighed_by_scatter(s).notes)
-
-
 @pytest.mark.parametrize("points", [12, 16, 30])
 def test_few_points_of_equal_noise_seldom_look_like_an_error_of_the_phase(points):
     """With one bound for all numbers of points, 3 to 8 of 100 sweeps of a power law got the note."""

@@ -136,7 +136,7 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep, factors: compression.Shares
         return fit._replace(details=details, warnings=warnings, run_time=seconds), sweep
     corrected = _shifted(weighed, known, best.values)
     corrected = corrected._replace(notes=(*sweep.notes, *_corrections(known, best)))
-    details = fit.details | {"instrument": instrument_numbers(errors, known)}
+    details = fit.details | best.fit.details | {"instrument": instrument_numbers(errors, known)}
     refitted = best.fit._replace(details=details, compile_time=fit.compile_time)
     if viscoelastic.TRIED in details:
         refitted = _beside_more_modes(fit, refitted, tried, weighed)
@@ -343,7 +343,8 @@ def _errors_of_instrument(fit: Fit, sweep: Sweep, values: np.ndarray | None = No
 
 def _fitted_again(fit: Fit, sweep: Sweep) -> Fit:
     """Fit the modes to the corrected moduli of `sweep`. The search begins at the values of the modes in `fit`."""
-    return viscoelastic.modes_from(sweep, np.asarray(fit.solution.u)[None], fit.kind)._replace(details=fit.details)
+    found = viscoelastic.modes_from(sweep, np.asarray(fit.solution.u)[None], fit.kind)
+    return found._replace(details=fit.details | found.details)
 
 
 def _halved_until_positive(sweep: Sweep, known: list[Nuisance], values: np.ndarray, step: np.ndarray) -> np.ndarray:

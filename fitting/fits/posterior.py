@@ -363,9 +363,9 @@ def of_sweep(fit: Fit, sweep: Sweep, count: int, seed: int = 0) -> Posterior:
 
 
 def _with_noise_shown(fit: Fit, sweep: Sweep) -> Sweep:
-    """Return the sweep with weights for the noise of G' and G'' that the residuals show. The sweep is unchanged if both
-    have the same relative noise, or if standard deviations are given. It is also unchanged if neighbouring residuals
-    are correlated, because they may then be a misfit of the model."""
+    """Return the sweep with weights for the noise of G' and G'' that the residuals show. The sweep is unchanged if all
+    values have the same relative noise, or if standard deviations are given. It is also unchanged if neighbouring
+    residuals are correlated, because they may then be a misfit of the model."""
     J, r = np.asarray(fit.solution.jacobian), np.asarray(fit.solution.residuals)
     unknown = fit.noise_root is None or alike_points.INDEPENDENT in fit.details
     sizes = None if unknown else sizes_shown(J, r, np.concatenate(sweep.deviations))

@@ -1,8 +1,4 @@
-"""Weights for moduli whose scatter is not proportional to the moduli: phase errors, or noise with one size in Pa.
-
-The scatter of G'' due to phase errors is proportional to |G*|, not to G''. Noise with one size in Pa comes from the
-resolution of the torque, if the strain is the same at all frequencies.
-"""
+"""Weights for loss moduli that scatter because of phase errors. This scatter is proportional to |G*|, not to G''."""
 
 import numpy as np
 
@@ -19,19 +15,16 @@ _FEWEST, _PER_DECADE = 8, 5.0
 #: Noise proportional to G'' is assumed only if its log-likelihood exceeds that of noise proportional to |G*| by more
 #: than this value. The reason: it is rare that only G'' has noise proportional to its own size.
 _BETTER = 8.0
-#: Noise with one size in Pa is assumed only if its log-likelihood exceeds those of the two other kinds by more than
-#: this value.
-_ONE_SIZE = 2.0
 #: Number of neighbouring points per polynomial in the comparison of the two kinds of noise.
 _NEIGHBOURS = 5
 
 
 def weighed_by_scatter(sweep: Sweep) -> Sweep:
     """Return the sweep with standard deviations from the scatter of its points, if phase errors cause the scatter of
-    G'', or if the scatter has one size in Pa. Otherwise return the sweep unchanged.
+    G''. Otherwise return the sweep unchanged.
 
-    If the residuals were divided by the moduli, points that are low by chance would have the largest weight. Where G''
-    << G', the model would then fit the noise.
+    The error of G'' is the phase error [rad] times G'. If the residuals were divided by G'', points that are low by
+    chance would have the largest weight. Where G'' << G', the model would then fit the noise.
     """
     omega, size = sweep.angular_frequency, np.hypot(sweep.storage, sweep.loss)
     if sweep.storage_sd is not None or len(np.unique(omega)) < max(len(omega), _FEWEST):
@@ -39,14 +32,6 @@ def weighed_by_scatter(sweep: Sweep) -> Sweep:
     x, sine = np.log(omega), sweep.loss / size
     if (len(x) - 1) * np.log(10) < _PER_DECADE * np.ptp(x) * (1 - 1e-6):
         return sweep
-    if (one := _one_size(x, sweep)) is not None:
-        note = (
-            f"G' and G'' scatter by {one:.2g} Pa at all frequencies, for example because of the resolution of the "
-            "torque. So the residuals are divided by this number, not by the moduli; give standard deviations if you "
-            "want other weights"
-        )
-        sd = np.full(len(x), one)
-        return sweep._replace(storage_sd=sd, loss_sd=sd, sd_estimated=True, notes=(*sweep.notes, note))
     storage, phase = (distance_from_smooth(x, y) for y in (np.log(sweep.storage), sine))
     scatters = float(np.median(phase * size / sweep.loss))
     if not (scatters > _SCATTERS and scatters > _MORE * (1 + _BY_CHANCE / len(x)) * storage):
@@ -60,26 +45,6 @@ def weighed_by_scatter(sweep: Sweep) -> Sweep:
     )
     storage_sd = np.maximum(storage, phase * sine) * sweep.storage
     return sweep._replace(storage_sd=storage_sd, loss_sd=phase * size, sd_estimated=True, notes=(*sweep.notes, note))
-
-
-def _one_size(x: np.ndarray, sweep: Sweep) -> float | None:
-    """Return the standard deviation of the noise [Pa], if noise with one size explains the scatter of G' and G'' better
-    than noise proportional to each modulus, and better than errors of the phase. Otherwise return None."""
-    middle = slice(_NEIGHBOURS // 2, len(x) - _NEIGHBOURS // 2)
-    storage, loss = (distances_from_polynomials(x, y, _NEIGHBOURS) for y in (sweep.storage, sweep.loss))
-    if not (np.any(storage) and np.any(loss)):
-        return None
-
-    def likelihood(off: np.ndarray, size: np.ndarray) -> float:
-        return float(-0.5 * len(off) * np.log(np.mean((off / size) ** 2)) - np.sum(np.log(size)))
-
-    both = np.concatenate([storage, loss])
-    of_storage = likelihood(storage, sweep.storage[middle])
-    others = [of_storage + likelihood(loss, size[middle]) for size in (sweep.loss, np.hypot(sweep.storage, sweep.loss))]
-    if likelihood(both, np.ones(len(both))) < max(others) + _ONE_SIZE:
-        return None
-    one = float(np.median(np.abs(both)) / 0.6745)
-    return one if one > _SCATTERS * float(sweep.loss.min()) else None
 
 
 def _likelier_in_proportion(x: np.ndarray, sine: np.ndarray) -> float:

@@ -15,6 +15,9 @@ from fitting.readers.frequency_sweep import Sweep
 from fitting.readers.noise_of_series import noise_of_series
 from fitting.readers.time_tests import TimeTest
 
+#: A factor that differs from 1 by less than this number is not printed.
+_ONE = 0.005
+
 
 class Prediction(NamedTuple):
     """A test with m measured values, and its prediction. The values are in the order of
@@ -111,7 +114,7 @@ def sentence(found: Prediction) -> str:
     if not np.isnan(found.covered):
         told += f"; {100 * found.covered:.0f} % of {inside} numbers lie in the 95 % interval of the prediction"
     with_factor = found._replace(predicted=found.factor * found.predicted)
-    if 100 * with_factor.relative_errors[counted].mean() <= 0.5 * off:
+    if abs(found.factor - 1) > _ONE and 100 * with_factor.relative_errors[counted].mean() <= 0.5 * off:
         told += f"; {found.factor:.3g} times the prediction would fit the test best"
     outside = share - inside
     also = "1 number outside the band is" if outside == 1 else f"{outside} numbers outside the band are"

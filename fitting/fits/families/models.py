@@ -275,7 +275,8 @@ def _with_rivals(chosen: Fit, tried: list[Fit], sweep: Sweep) -> Fit:
 
 def compared_again(chosen: Fit, sweep: Sweep, at_rest: Callable[[Fit], Fit]) -> Fit:
     """Return the fit of free Prony modes with the other models, which are fitted again to a corrected sweep. Nothing is
-    fitted if the fit was not compared with other models before.
+    fitted if the fit was not compared with other models before. The correction was found with the chosen model, so the
+    comparison favours this model.
 
     Args:
         chosen: fit to the corrected sweep, with the table of the models that were fitted to the sweep before.

@@ -81,7 +81,7 @@ def sizes_shown(J: np.ndarray, r: np.ndarray, scales: np.ndarray) -> np.ndarray 
         J, r: see `uneven_root`.
         scales: divisors (2m,) of the residuals [Pa].
     """
-    if not _determined(J) or len(r) <= J.shape[1] + 1:
+    if not _well_conditioned(J) or len(r) <= J.shape[1] + 1:
         return None
     grouped = grouped_sizes(J, r, np.arange(len(r)) >= len(r) // 2)
     constant = np.median(scales) / scales
@@ -101,7 +101,7 @@ def grouped_sizes(J: np.ndarray, r: np.ndarray, second: np.ndarray) -> np.ndarra
         J, r: see `uneven_root`.
         second: whether each residual (n,) belongs to the second group.
     """
-    if not _determined(J):
+    if not _well_conditioned(J):
         return None
     scale = np.linalg.norm(J, axis=0)
     leverage = np.einsum("kn,nk->n", np.linalg.pinv(J / scale), J / scale)
@@ -116,7 +116,7 @@ def grouped_sizes(J: np.ndarray, r: np.ndarray, second: np.ndarray) -> np.ndarra
     return np.sqrt(variance)[second.astype(int)]
 
 
-def _determined(J: np.ndarray) -> bool:
+def _well_conditioned(J: np.ndarray) -> bool:
     """Return whether residuals with the derivatives J (n, p) determine all combinations of the p unknowns."""
     scale = np.linalg.norm(J, axis=0)
     if not (np.all(np.isfinite(J)) and np.all(scale > 0)):
