@@ -69,7 +69,9 @@ def test_surfaces_of_elements_are_groups_of_triangles(tmp_path, order):
         )
     )
     (tmp_path / "m.inp").write_text("\n".join([*text, "*SURFACE, NAME=a", "nothing, S1"]) + "\n")
-    with pytest.raises(lj.InputError, match=r"\*SURFACE contains nothing, but the file does not define this set"):
+    with pytest.raises(
+        lj.InputError, match=r"\*SURFACE contains nothing, but the file does not define this set of elements"
+    ):
         lj.read_mesh(tmp_path / "m.inp")
 
 
@@ -232,7 +234,7 @@ def test_quadratic_elements_and_included_files(tmp_path):
         ("*ELEMENT, TYPE=C3D9\n103" + 9 * ", 11" + "\n", "elements of type C3D9; export tetrahedra"),
         ("*NODE\n16, 1, one, 1\n", "contains a wrong number"),
         ("*NSET, NSET=foot\nnobody\n", "contains nobody, but the file does not define this set"),
-        ("*NSET, NSET=foot, ELSET=None\n", r"\*NSET contains None, but the file does not define this set"),
+        ("*NSET, NSET=foot, ELSET=None\n", r"\*NSET contains None, but the file does not define this set of elements"),
         ("*NSET, NSET=foot, GENERATE\n1, 2, 0\n", "give first, last, step"),
         ("*NGEN\n11, 15\n", r"\*NGEN moves or creates nodes or elements"),
         ("*INSTANCE, NAME=one, PART=two\n0, 0, 5\n", r"\*INSTANCE moves or creates nodes or elements"),

@@ -13,7 +13,7 @@ from fitting.rigs import torsion
 from fitting.rigs.torsion import Drive
 from liverjax.core import bounds
 from liverjax.core.errors import InputError
-from liverjax.core.struct import replace
+from liverjax.core.struct import in_precision, replace
 from liverjax.mesh.cylinders import graded_cylinder
 from liverjax.mesh.nodal import nodal_volumes
 from liverjax.physics.base import Step
@@ -307,6 +307,16 @@ def test_the_mesh_error_of_a_plate_on_quadratic_elements(by):
     value, change = result.mesh_error.change(result_of, result)
     assert bool(result.mesh_error.found.all())
     assert 0.5 < change / (FINE[by] - value) < 2
+
+
+@pytest.mark.parametrize("size", [(6, 6, 1), (40, 40, 1)])
+def test_a_loose_plate_of_many_nodes_is_refused_in_float32(size):
+    """The roundoff of many rows counted as a support."""
+    mesh = lj.shapes.box((0.1, 0.1, 0.1), size)
+    plate = RigidPlate(nodes=mesh.node_sets["z_max"], turn=0.0, by="torque", centre=(0.05, 0.05, 0.0))
+    scene = lj.Scene(mesh=mesh, law=lj.laws.NeoHookean(mu=1.0, bulk=3.0), physics=(plate,))
+    with pytest.raises(InputError, match="do not prevent every rigid motion"):
+        check_held(jax.tree.map(lambda leaf: in_precision(leaf, jnp.float32), scene))
 
 
 @pytest.mark.parametrize(("by", "lifts"), [("angle", False), ("angle", True), ("torque", False), ("torque", True)])

@@ -93,7 +93,9 @@ def _last_state(file: Path, scene: Scene) -> tuple[jax.Array, np.ndarray]:
     except FileNotFoundError:
         raise InputError(f"--about {file} does not exist: give the result.h5 of a run of this scene") from None
     except (OSError, KeyError, IndexError) as error:
-        raise InputError(f"--about {file} contains no positions: give the result.h5 of a run of this scene") from error
+        raise InputError(
+            f"--about {file} contains no positions or no reference shape: give the result.h5 of a run of this scene"
+        ) from error
     if x.shape != scene.mesh.points.shape:
         raise InputError(
             f"--about {file} has {len(x)} nodes, but the scene has {scene.mesh.number_of_nodes}: give a run of the "
@@ -105,7 +107,8 @@ def _last_state(file: Path, scene: Scene) -> tuple[jax.Array, np.ndarray]:
         raise InputError(
             f"--about {file} has another reference shape than the scene (nodes differ by up to {apart:.2g} m): give a "
             'run of the same shape; if that run has a loaded mesh, repeat it with --vtu, and write file = "…" with its '
-            "file vtu/step_00001.vtu into [mesh] of the scene. Select nodes with where, since this file has no sets"
+            "file vtu/step_00001.vtu into [mesh] of the scene. This file is in metres and has no sets: remove unit, "
+            "and select nodes and elements with where"
         )
     if code not in (status.CONVERGED, status.ONE_STEP):
         raise InputError(

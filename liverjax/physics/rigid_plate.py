@@ -104,8 +104,10 @@ class RigidPlate(Physics):
         Each node of the plate is fixed towards the axis, around it and along it. If the plate itself can move in this
         way, only the difference to the node farthest from the axis is fixed.
         """
-        nodes, arms = np.asarray(self.nodes), np.asarray(self.at_rest(mesh).arms(mesh.points))
-        radii, axis = np.linalg.norm(arms, axis=1), np.broadcast_to(np.asarray(self.axis, arms.dtype), arms.shape)
+        # With float64, roundoff does not look like a constraint.
+        nodes, axis, centre = np.asarray(self.nodes), np.asarray(self.axis, float), np.asarray(self.centre, float)
+        arms = np.cross(axis, np.asarray(mesh.points, float)[nodes] - centre)
+        radii, axis = np.linalg.norm(arms, axis=1), np.broadcast_to(axis, arms.shape)
         far = int(np.argmax(radii))
         some, ratio = arms[far] / radii[far], (radii / radii[far])[:, None]
         # On the axis, all directions around it are equally good.

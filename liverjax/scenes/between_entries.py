@@ -28,8 +28,8 @@ def joined_entries(
 ) -> Scene:
     """Return the scene `made` with additional entries for the new nodes between the entries of the scene `old`.
 
-    A new node between two motions with different histories stays free. If the positions of the mesh are unknown
-    (inside jit, grad or vmap), no entry is added.
+    A new node of linear elements between two motions with different histories stays free. If the positions of the mesh
+    are unknown (inside jit, grad or vmap), no entry is added.
 
     Args:
         old, made: the scene before and after the conversion.

@@ -34,8 +34,8 @@ class Body:
 
     In linear elements, the lumped mass of a node is its density times a quarter of the volume of its elements. With
     consistent masses and one density per node, each element has one density: its lumped mass divided by its volume. The
-    weight belongs to the same masses, also in static runs. In quadratic elements with lumped masses, only the total
-    weight does.
+    weight belongs to the same masses, also in static runs. In quadratic elements with lumped masses, the weights of
+    single nodes differ from their masses times gravity, and only the totals agree.
     """
 
     density: Number = param(

@@ -228,14 +228,15 @@ def _cards_of_sets(cards: list[_Card], key: str) -> dict[_Place, list[int]]:
     return found
 
 
-def _place_of(name: str, inside: bool, places: Iterable[_Place], where: str) -> _Place:
-    """Return the place of the set that a card names. `inside`: whether the card belongs to the part."""
+def _place_of(name: str, inside: bool, places: Iterable[_Place], where: str, kind: str) -> _Place:
+    """Return the place of the set that a card names. `inside`: whether the card belongs to the part. `where`, `kind`:
+    keyword of the card, and the kind of the set (set of nodes or of elements), for messages."""
     small = name.lower()
     last = small.rpartition(".")[2]  # the name of the part or of the assembly may stand before the name of the set
     candidates = ((inside, small), (True, small), (True, last), (False, small), (False, last))
     at = next((place for place in candidates if place in places), None)
     if at is None:
-        raise _Wrong(f"*{where} contains {name}, but the file does not define this set; define it")
+        raise _Wrong(f"*{where} contains {name}, but the file does not define this {kind}; define it")
     return at
 
 
@@ -258,7 +259,7 @@ def _members(
             numbers, others = _listed(cards[k], of_elements) if cards[k].keyword == key else (by_card.get(k, ()), ())
             together.update(numbers)
             for other in others:
-                together |= members(_place_of(other, own[0], found, key), (*outer, own))
+                together |= members(_place_of(other, own[0], found, key, "set"), (*outer, own))
         return together
 
     return {place: members(place, ()) for place in found}
@@ -288,7 +289,7 @@ def _surfaces(
         for line in card.lines if card.parameters.get("TYPE", "ELEMENT").upper() == "ELEMENT" else ():
             of, face = line[0], line[1].upper() if len(line) > 1 else ""
             last = of.rpartition(".")[2]  # the name of the part may stand before the number
-            place = None if last.isdigit() else _place_of(of, card.inside, element_sets, "SURFACE")
+            place = None if last.isdigit() else _place_of(of, card.inside, element_sets, "SURFACE", "set of elements")
             members = {int(last)} if place is None else element_sets[place]
             if face in _FACES:
                 own = [corners[k][list(_FACES[face])] for k in sorted(members & corners.keys())]
@@ -299,7 +300,7 @@ def _surfaces(
 def _listed(card: _Card, of_elements: dict[_Place, set[int]]) -> tuple[set[int], list[str]]:
     """Return the numbers, and the names of other sets (in small letters), that a card of a set contains."""
     if card.keyword == "NSET" and "ELSET" in card.parameters:
-        return of_elements[_place_of(card.parameters["ELSET"], card.inside, of_elements, "NSET")], []
+        return of_elements[_place_of(card.parameters["ELSET"], card.inside, of_elements, "NSET", "set of elements")], []
     numbers, others = set(), []
     # In the assembly, numbers without the name of an instance belong to reference points.
     of_part = card.inside or "INSTANCE" in card.parameters

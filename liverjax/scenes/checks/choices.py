@@ -86,7 +86,8 @@ def _loaded(scene: Scene) -> None:
 
 
 def check_volumetric(scene: Scene) -> None:
-    """Check that the materials of a scene can be used with its setting `volumetric`. No other setting has an effect.
+    """Check that the materials of a scene can be used with its setting `volumetric`. Other keys of `[solve]` are not
+    checked.
 
     Raises:
         InputError: the materials do not allow pressures as unknowns.

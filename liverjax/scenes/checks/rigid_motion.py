@@ -67,7 +67,7 @@ def loose_piece(scene: Scene, holds: Callable[[Physics], tuple[np.ndarray, np.nd
     pieces, label = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), shape=(n, n)), directed=False)
     fixed = np.argwhere(~free_places(scene.mesh, scene.fixed, scene.displaced))
     both = [(fixed[:, 0], np.eye(3)[fixed[:, 1]]), *(holds(physics) for physics in scene.physics)]
-    points = np.asarray(scene.mesh.points)
+    points = np.asarray(scene.mesh.points, float)
     for piece in range(pieces):
         inside = label == piece
         size = np.ptp(points[inside], axis=0).max()
