@@ -131,6 +131,7 @@ def test_the_change_of_momentum_is_the_force_at_the_end(order, mass):
     assert np.allclose(force, -contact, atol=1e-6 * size)
 
 
+@pytest.mark.slow
 def test_gradients_of_reactions_with_consistent_mass():
     """In reverse mode, a cotangent on fixed nodes was multiplied by a matrix that is singular there. The result was
     NaN.

@@ -50,6 +50,7 @@ def test_the_force_by_quadratic_elements():
     assert np.isclose(_pulled(scene), QUADRATIC, rtol=1e-7)  # Newton's tolerance is 1e-8
 
 
+@pytest.mark.slow
 def test_mesh_error_of_a_small_strain_is_the_way_to_quadratic_elements():
     """The problem is linear, so one linear solve gives the quadratic solution, up to the solver's tolerance of 1e-2."""
     scene = _pull(1, 2)

@@ -34,6 +34,7 @@ def _bar(cells: tuple, order: int = 1, **changes) -> lj.Scene:
     return lj.Scene(mesh=mesh, law=law, fixed=(lj.Fixed(nodes=held),), body=body, **changes)
 
 
+@pytest.mark.slow
 def test_the_error_of_a_body_that_is_about_to_buckle():
     """The stiffness of the shape at rest gave an error of 0.2 %, where the true error was 4 %."""
     mesh = lj.shapes.box([0.1, 0.02, 0.02], [6, 1, 1])

@@ -154,6 +154,7 @@ def test_the_derivative_of_a_turned_body(rig):
     assert angle(770.0) > 0.3 and errors[1] < 1e-5 and errors[1] < min(errors[0], errors[2])
 
 
+@pytest.mark.slow
 def test_the_derivative_of_a_turned_body_with_pressures():
     """The derivative's linear solves took conjugate gradients for a matrix that is not positive definite: NaN."""
     mesh = lj.shapes.box((0.1, 0.1, 0.15), (2, 2, 2))

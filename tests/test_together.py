@@ -85,7 +85,7 @@ def test_the_noise_of_every_test_is_found_if_it_differs_a_thousandfold():
     assert np.sqrt(np.mean(np.square(off))) < 2
 
 
-@pytest.mark.parametrize("points", [4, 8])
+@pytest.mark.parametrize("points", [4, pytest.param(8, marks=pytest.mark.slow)])
 def test_the_noise_of_a_short_test_does_not_run_to_zero(points):
     """Parameters can fit a few values exactly. Their noise then fell in every round, and their weight grew without
     bound: a relaxation time was wrong by hundreds of standard errors."""
