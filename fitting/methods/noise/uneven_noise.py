@@ -61,6 +61,8 @@ def probability_of_sizes(J: np.ndarray, r: np.ndarray, size: np.ndarray) -> tupl
 _CHANCE, _CONDITION = 1e-3, 1e-8
 #: Noise with one size in Pa is assumed only if its log-likelihood exceeds that of relative noise by this value.
 _LIKELIER = 5.0
+#: Residuals are smooth if the correlation of neighbours, times the root of their number, exceeds this value.
+_ALIKE = 2.0
 
 
 def root_of_sizes(J: np.ndarray, sizes: np.ndarray, slope: np.ndarray) -> np.ndarray:
@@ -84,6 +86,8 @@ def sizes_shown(J: np.ndarray, r: np.ndarray, scales: np.ndarray) -> np.ndarray 
     if not _well_conditioned(J) or len(r) <= J.shape[1] + 1:
         return None
     grouped = grouped_sizes(J, r, np.arange(len(r)) >= len(r) // 2)
+    if _are_smooth(r):  # a misfit of the model, not noise
+        return grouped
     constant = np.median(scales) / scales
     others = [np.ones(len(r))] + ([] if grouped is None else [grouped])
     best, level = probability_of_sizes(J, r, constant)
@@ -114,6 +118,14 @@ def grouped_sizes(J: np.ndarray, r: np.ndarray, second: np.ndarray) -> np.ndarra
     if large == small or 2 * chance > _CHANCE:
         return None
     return np.sqrt(variance)[second.astype(int)]
+
+
+def _are_smooth(r: np.ndarray) -> bool:
+    """Return whether neighbouring residuals of G', or of G'' (second half of r), are more alike than chance explains.
+    The neighbours are those in the order of the frequencies."""
+    first, second = r[: len(r) // 2], r[len(r) // 2 :]
+    alike = (first[1:] @ first[:-1] + second[1:] @ second[:-1]) / max(float(r @ r), 1e-300)
+    return bool(alike > _ALIKE / np.sqrt(len(r)))
 
 
 def _well_conditioned(J: np.ndarray) -> bool:
