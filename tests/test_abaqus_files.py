@@ -86,6 +86,40 @@ def test_a_surface_may_have_the_name_of_a_set_of_elements(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "more", ["*SURFACE, NAME=b, COMBINE=UNION\na, a\n", "*SURFACE, NAME=b\n,\n", "*SURFACE, NAME=b\nx, SPOS\n"]
+)
+def test_surfaces_without_listed_faces_are_ignored(tmp_path, more):
+    """A combined surface, the whole free surface, or an unknown set of shells made the whole file unreadable."""
+    assert "b" not in sets_of(tmp_path, more)
+    assert sets_of(tmp_path, "*SURFACE, NAME=a\n101, S1\n" + more)["a"] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("zero", ["0", "0.0E+00", "0.D0"])
+def test_letters_in_a_data_line_after_a_comma(tmp_path, zero):
+    """The letter of an exponent or of a face made the first data line a part of the keyword line."""
+    text = HEAD.replace("nset=all\n11, 0,", f"nset=all,\n11, {zero},") + "*SURFACE, NAME=a,\n101, S1\n"
+    (tmp_path / "m.inp").write_text(text)
+    found = lj.read_mesh(tmp_path / "m.inp")
+    assert np.asarray(found.node_sets["all"]).tolist() == [0, 1, 2, 3, 4]
+    assert np.asarray(found.triangle_sets["a"]).tolist() == [[0, 2, 1]]
+
+
+def test_surfaces_of_the_part_and_of_the_assembly_are_different_surfaces(tmp_path):
+    """They were merged without a word."""
+    assembly = (
+        "*ASSEMBLY, NAME=A\n*INSTANCE, NAME=P-1, PART=P\n*END INSTANCE\n*SURFACE, NAME=A\nP-1.101, S2\n*END ASSEMBLY\n"
+    )
+    surfaces = "*SURFACE, NAME=a\n101, S1\n*SURFACE, NAME=own\n101, S3\n"
+    (tmp_path / "m.inp").write_text("*PART, NAME=P\n" + HEAD + surfaces + "*END PART\n" + assembly)
+    found = lj.read_mesh(tmp_path / "m.inp").triangle_sets
+    assert {name: np.asarray(own).tolist() for name, own in found.items() if name != "skin"} == {
+        "P.a": [[0, 2, 1]],
+        "a": [[0, 1, 3]],
+        "own": [[1, 2, 3]],
+    }
+
+
+@pytest.mark.parametrize(
     ("cards", "members"),
     [
         ("*ELSET, ELSET=hard\n101,\n*ELSET, ELSET=hard\n102,\n", {"hard": [0, 1]}),

@@ -8,7 +8,9 @@ from test_harmonic import DENSITY, FREQUENCIES, MU, PRONY, around_a_sphere, modu
 import liverjax as lj
 from liverjax.core.struct import replace
 from liverjax.mesh import cylinders
+from liverjax.scenes.checks.choices import check_volumetric
 from liverjax.scenes.enriched import enriched
+from liverjax.simulation.automatic import form_of_volumes
 from liverjax.waves.harmonic import element_operator
 from liverjax.waves.mesh_error import _richer_elements
 
@@ -133,6 +135,21 @@ def test_cubic_elements_keep_the_form_that_auto_chose(part, form):
     viscosity, solve = replace(PRONY, part=part), lj.Solve(volumetric="auto")
     scene = lj.Scene(mesh=mesh, law=lj.laws.NeoHookean(mu=770.0, bulk=770000.0), viscosity=viscosity, solve=solve)
     assert _richer_elements(scene).solve.volumetric == form
+
+
+@pytest.mark.parametrize(("below", "form"), [(None, "mixed"), (0.1, "element")])
+def test_nodal_volumes_become_what_quadratic_elements_allow(below, form):
+    """They became "mixed" always. A law that is continued below a volume ratio does not allow it: an InputError."""
+    law = lj.laws.NeoHookean(mu=770.0, bulk=7700.0)
+    scene = lj.Scene(
+        mesh=lj.shapes.box((0.02, 0.02, 0.02), (1, 1, 1)),
+        law=law if below is None else lj.laws.continued(law, below),
+        solve=lj.Solve(kind="harmonic", frequencies=jnp.array([40.0]), volumetric="nodal"),
+    )
+    assert form_of_volumes(_richer_elements(scene)) == form
+    if below is not None:
+        with pytest.raises(lj.InputError, match="cannot be used with continued_below: remove continued_below, or use"):
+            check_volumetric(replace(scene, solve=lj.Solve(volumetric="mixed")))
 
 
 def test_a_body_whose_density_varies_keeps_it_in_the_richer_space():

@@ -1,5 +1,6 @@
 """The state of rest about which a body oscillates: which loads act there, and which are amplitudes only."""
 
+from functools import partial
 from types import SimpleNamespace
 
 import h5py
@@ -14,6 +15,7 @@ from liverjax.__main__ import main
 from liverjax.core.struct import replace
 from liverjax.jobs import output, waves
 from liverjax.mesh.tetrahedra import with_points
+from liverjax.physics.attached.ligament import Ligament
 from liverjax.physics.porosity import Inlet
 from liverjax.scenes.scene_file import scene_from
 from liverjax.scenes.springpots import springpot_factors
@@ -190,6 +192,24 @@ def test_a_springpot_without_spring_is_refused_inside_jit_too():
         jax.jit(lambda mu: check(mu, np.array([0.5])))(2000.0)
     jax.jit(lambda mu: check(mu, np.array([0.0])))(2000.0)  # a spring
     jax.jit(check)(2000.0, jnp.array([0.5]))  # an unknown exponent may be 0
+
+
+def test_a_slack_ligament_needs_no_state_of_rest_inside_jit_either():
+    """Inside jit and grad, every ligament was regarded as tight, so a body without a spring had no derivatives."""
+    mesh = lj.shapes.box((0.02, 0.02, 0.02), (1, 1, 1))
+    springpots = lj.SpringpotSeries(times=[1.0], exponents=np.array([0.5]), spring=0.0)
+    nodes, to = np.asarray(mesh.node_sets["z_max"])[None], np.array([0.01, 0.01, 0.06])
+    given = {"nodes": nodes, "weights": np.ones(nodes.shape), "to": to, "stiffness": 5.0}
+
+    def at_rest(mu, length):
+        physics, law = (Ligament(**given, rest_length=length),), lj.laws.NeoHookean(mu=mu, bulk=20000.0)
+        assert under_its_weight(lj.Scene(mesh=mesh, law=law, springpots=springpots, physics=physics)) is None
+
+    jax.eval_shape(partial(at_rest, length=0.05), 2000.0)
+    jax.jvp(lambda mu: (at_rest(mu, 0.05), mu)[1], (2000.0,), (1.0,))
+    for tight in (partial(at_rest, length=0.03), lambda mu: at_rest(mu, 1e-5 * mu)):
+        with pytest.raises(lj.InputError, match=r"springpots.spring = 0 leaves no shear stiffness at rest"):
+            jax.eval_shape(tight, 2000.0)
 
 
 def _quadratic_body(part: str) -> lj.Scene:

@@ -105,7 +105,8 @@ def _richer_elements(scene: Scene) -> Scene:
         volumetric = "mixed" if form_of_volumes(scene) == "mixed" else "element"
         return replace(rich, solve=replace(rich.solve, volumetric=volumetric))
     if scene.solve.volumetric == "nodal":
-        return replace(rich, solve=replace(rich.solve, volumetric="mixed"))
+        # "auto" chooses "mixed" if the laws allow it, otherwise "element".
+        return replace(rich, solve=replace(rich.solve, volumetric="auto"))
     return rich
 
 

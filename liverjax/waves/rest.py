@@ -98,14 +98,14 @@ def _is_heavy(scene: Scene) -> bool:
 
 def _is_pulled(still: Scene) -> bool:
     """Return whether forces other than gravity act on free nodes in the reference shape. Inside jit, grad or vmap,
-    return whether the scene has a ligament."""
+    return whether the scene has a ligament that is tight or may be tight."""
     if not still.physics:
         return False
     # The relaxed law may have no stiffness left (springpots with spring = 0), so the law before relaxation is used.
     law = still.law if still.unrelaxed is None else still.unrelaxed
     alone = replace(still, law=law, unrelaxed=None, fixed=(), displaced=(), body=None, porosity=None)
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((alone, still.fixed))):
-        return any(isinstance(physics, Ligament) for physics in still.physics)
+        return any(isinstance(own, Ligament) and own.is_tight(still.mesh) for own in still.physics)
     alone = prepared(replace(alone, solve=Solve(volumetric=still.solve.volumetric)))
     x = jnp.asarray(still.mesh.points)
     free = np.asarray(free_degrees(still.mesh, still.fixed, ()))

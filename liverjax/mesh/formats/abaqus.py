@@ -55,8 +55,8 @@ class _Block(NamedTuple):
 def read_abaqus(path: Path) -> "meshio.Mesh":
     """Read an Abaqus input file with one part. The mesh and its sets have the form in which `meshio.read` returns them.
 
-    If the part and the assembly both have a set named SET, the set of the part gets the name PART.SET. Nodes of the
-    assembly are reference points, which are ignored.
+    If the part and the assembly both have a set or surface named SET, that of the part gets the name PART.SET. Nodes of
+    the assembly are reference points, which are ignored.
 
     Raises:
         InputError: the file cannot be read, has several parts, or creates nodes or elements by keywords such as *NGEN.
@@ -110,7 +110,7 @@ def _cards(path: Path, outer: tuple[Path, ...]) -> Iterator[_Card]:
     for line in text.splitlines():
         if line.startswith("**") or not line.strip():
             continue
-        if begun and not line.startswith("*") and "=" not in line and not re.search("[A-Za-z]", line):
+        if begun and _is_data(line):
             begun = begun.rstrip(",")  # a data line follows, so the comma at the end of the keyword line is not needed
             yield from () if card is None else _with_included(card, outer)
             card, begun = _card(begun), ""
@@ -122,6 +122,11 @@ def _cards(path: Path, outer: tuple[Path, ...]) -> Iterator[_Card]:
         elif card is not None:
             card.lines.append([cell.strip(' \t"') for cell in line.split(",")])
     yield from () if card is None else _with_included(card, outer)
+
+
+def _is_data(line: str) -> bool:
+    """Return whether a line after a comma is a data line: it begins with a whole number, or has no letters."""
+    return re.match(r"\s*\d+\s*,", line) is not None or not re.search("^[*]|=|[A-Za-z]", line)
 
 
 def _card(line: str) -> _Card:
@@ -270,31 +275,49 @@ def _sets_by_name(cards: list[_Card], key: str, members: dict[_Place, set[int]])
     names: dict[str, str] = {}
     for (_, name), own in _cards_of_sets(cards, key).items():
         names.setdefault(name, cards[own[0]].parameters[key])
+    return {_full_name(cards, place, names, members): own for place, own in members.items()}
+
+
+def _full_name(cards: list[_Card], at: _Place, names: dict[str, str], places: Iterable[_Place]) -> str:
+    """Return the name of a set or surface, after the name of the part if the assembly has one with the same name.
+
+    Args:
+        cards: cards of the file.
+        at: place of the set or surface.
+        names: {name in small letters: name as the file first writes it}.
+        places: places of all sets or surfaces.
+    """
+    inside, name = at
     part = next((card.parameters.get("NAME", "part") for _, card in _cards_of(cards, "PART")), "")
-    return {
-        f"{part}.{names[name]}" if inside and (False, name) in members else names[name]: own
-        for (inside, name), own in members.items()
-    }
+    return f"{part}.{names[name]}" if inside and (False, name) in places else names[name]
 
 
 def _surfaces(
     cards: list[_Card], element_sets: dict[_Place, set[int]], blocks: dict[int, _Block]
 ) -> dict[str, np.ndarray]:
     """Return {name of a ``*SURFACE`` card: corners (m, 3) of its triangles}. A data line contains an element, or a set
-    of elements, and one of `_FACES`. Other surfaces (of nodes or shells, or analytical surfaces) are ignored."""
+    of elements, and one of `_FACES`. Other surfaces are ignored: surfaces of nodes or shells, analytical surfaces,
+    combined or cropped surfaces, and the whole free surface (a data line without an element)."""
     tetrahedra = [block for block in blocks.values() if block.kind in ("tetra", "tetra10")]
     corners = {k: own[:4] for block in tetrahedra for k, own in zip(block.labels, block.nodes, strict=True)}
-    found: dict[str, list[np.ndarray]] = {}
+    found: dict[_Place, list[np.ndarray]] = {}
+    names: dict[str, str] = {}
     for _, card in _cards_of(cards, "SURFACE"):
-        for line in card.lines if card.parameters.get("TYPE", "ELEMENT").upper() == "ELEMENT" else ():
+        combined = {"COMBINE", "CROP"} & card.parameters.keys()
+        of_elements = card.parameters.get("TYPE", "ELEMENT").upper() == "ELEMENT"
+        if combined or not of_elements or not all(line[0] for line in card.lines):
+            continue
+        name = card.parameters.get("NAME", "surface")
+        names.setdefault(name.lower(), name)
+        for line in card.lines:
             of, face = line[0], line[1].upper() if len(line) > 1 else ""
-            last = of.rpartition(".")[2]  # the name of the part may stand before the number
-            place = None if last.isdigit() else _place_of(of, card.inside, element_sets, "SURFACE", "set of elements")
-            members = {int(last)} if place is None else element_sets[place]
             if face in _FACES:
+                last = of.rpartition(".")[2]  # the name of the part may stand before the number
+                at = None if last.isdigit() else _place_of(of, card.inside, element_sets, "SURFACE", "set of elements")
+                members = {int(last)} if at is None else element_sets[at]
                 own = [corners[k][list(_FACES[face])] for k in sorted(members & corners.keys())]
-                found.setdefault(card.parameters.get("NAME", "surface"), []).extend(own)
-    return {name: np.array(own) for name, own in found.items() if own}
+                found.setdefault((card.inside, name.lower()), []).extend(own)
+    return {_full_name(cards, at, names, found): np.array(own) for at, own in found.items() if own}
 
 
 def _listed(card: _Card, of_elements: dict[_Place, set[int]]) -> tuple[set[int], list[str]]:

@@ -118,6 +118,14 @@ class Ligament(Physics):
         f = np.asarray(self._vectors(mesh.points))[taut]
         return np.asarray(self.nodes)[0, taut], f / lengths[taut, None]
 
+    def is_tight(self, mesh: TetMesh) -> bool:
+        """Return whether a fibre has a tension in the reference shape; True if its numbers are unknown (as in jit)."""
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((self, mesh.points))):
+            return True
+        with jax.ensure_compile_time_eval():  # inside jit, jnp would make tracers of the known numbers too
+            lengths, rest = np.asarray(self._lengths(jnp.asarray(mesh.points))), np.asarray(self._rest(mesh))
+        return bool(np.any(lengths > (1 + _ROUNDED) * rest))
+
     def pulls_single_nodes(self) -> bool:
         """Return True: at each end, a fibre pulls at one node or at the nodes of one element, not on an area."""
         return True

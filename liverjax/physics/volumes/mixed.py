@@ -42,8 +42,8 @@ def check_mixed_laws(several: Sequence[Law], name: str = "[solve] volumetric = '
     """Check that pressures can be unknowns with the laws of a body.
 
     Raises:
-        InputError: a law has no isochoric part or no bulk modulus, or the laws have different kinds of volumetric
-            energy.
+        InputError: a law has no isochoric part or no bulk modulus, or is continued below a volume ratio, or the laws
+            have different kinds of volumetric energy.
     """
     kinds = set()
     for law in several:
@@ -54,8 +54,12 @@ def check_mixed_laws(several: Sequence[Law], name: str = "[solve] volumetric = '
                 "law"
             )
         parts = [part for own in U.pieces() for part in own.summands() if isinstance(part, Volumetric)]
-        kinds |= {(part.volumetric, part.below) for part in parts}
-    if len(kinds) != 1 or next(iter(kinds))[1] is not None:
+        if any(part.below is not None for part in parts):
+            raise InputError(
+                f"{name} cannot be used with continued_below: remove continued_below, or use 'element' or 'nodal'"
+            )
+        kinds |= {part.volumetric for part in parts}
+    if len(kinds) != 1:
         raise InputError(
             f"{name} needs the same kind of volumetric energy in all laws: give the same value of volumetric to all "
             "laws"
