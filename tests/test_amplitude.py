@@ -232,6 +232,15 @@ def test_two_temperatures_and_deviations(tmp_path, tanned):
             assert any("storage_modulus_sd_Pa are not used" in note for note in notes)
 
 
+def test_a_comma_that_may_separate_thousands_is_told(tmp_path):
+    """A storage modulus of "1,250" Pa was read as 1.25 Pa without the note that a frequency sweep gets."""
+    rows = "".join(f'1,{k},"1,{250 - k}",{120 + k}\n' for k in range(1, 7))
+    head = "Frequency (Hz),Strain (%),Storage modulus (Pa),Loss modulus (Pa)\n"
+    (tmp_path / "sweep.csv").write_text(head + rows)
+    (note,) = strain_sweep.read_strain_sweep(tmp_path / "sweep.csv").notes
+    assert note.startswith("1,249 is read as 1.249: if the comma separates thousands")
+
+
 def test_a_frequency_beyond_the_series_is_told():
     """Without the fastest of three modes, c1 was 25 % too small, and no warning named the series."""
     memory = law_fit.Memory(Maxwell(2000.0, np.array([0.3, 0.2]), np.array([1.0, 0.05])))

@@ -166,6 +166,29 @@ def test_rows_of_a_contact_that_shrinks_are_left_out(tmp_path, shape, back):
         assert test.time[-1] == pytest.approx(4.7)
 
 
+@pytest.mark.parametrize(("rows", "noise"), [(301, 0.005), (1501, 0.01)])
+@pytest.mark.parametrize("back", [0.0, 0.05])
+def test_the_scatter_of_a_held_sphere_is_no_retraction(tmp_path, rows, noise, back):
+    """1447 of 1501 rows were ignored. With 301 rows, the strain kept its scatter, because rows were added before."""
+    time, rng = np.linspace(0, 30, rows), np.random.default_rng(0)
+    d = 3e-4 * (np.minimum(time / 0.5, 1) - back * np.clip((time - 25) / 0.5, 0, 1))
+    scattered = d + noise * 3e-4 * rng.standard_normal(rows) * (time > 0)
+    columns = (time, scattered, np.maximum(d, 0) * 100 * (1 + np.exp(-time)))
+    test = read_described(written(tmp_path, {"test": "sphere", "thickness": 5e-3, "radius": 3e-3}, columns))
+    assert sum("the displacement scatters by" in note for note in test.notes) == 1
+    assert not any("scatter" in note and "the displacement" not in note for note in test.notes)
+    assert any("shrinks" in note for note in test.notes) == bool(back)
+    assert 25 < test.time[-1] < 26 if back else test.time[-1] == 30
+    assert np.ptp(test.driven[(test.time > 1) & (test.time < 25)]) < 1e-9 * test.driven.max()
+
+
+def test_a_sphere_with_four_rows_has_too_few_responses(tmp_path):
+    """The message was an IndexError."""
+    held = np.arange(4.0), np.array([0.0, 1e-4, 1e-4, 1e-4]), np.array([0.0, 1, 0.9, 0.8])
+    with pytest.raises(lj.InputError, match="3 usable responses remain"):
+        read_described(written(tmp_path, {"test": "sphere", "thickness": 5e-3, "radius": 3e-3}, held))
+
+
 @SLOW
 def test_a_compression_by_a_fifth_is_computed(tmp_path):
     """At a compression of 15 %, the finest cells at the rims of this disc invert. The computation continues with

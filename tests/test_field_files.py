@@ -91,6 +91,18 @@ def test_tables_of_displacements_of_other_programs(tmp_path, written):
     assert np.allclose(found.measured, 1e-3 * np.array([[1e-3, 0, -2e-4], [0, 0.25, 1]]), rtol=1e-14)
 
 
+def test_noise_that_the_column_sd_replaces_is_told(tmp_path, capsys):
+    """--noise had no effect on a file with a column sd, without a note."""
+    _scene(tmp_path)
+    (tmp_path / "own.csv").write_text("node,ux,uy,uz,sd\n5,1e-3,,0,2e-4\n6,1e-3,0,0,1e-4\n")
+    (tmp_path / "none.csv").write_text("node,ux,uy,uz\n5,1e-3,,0\n6,1e-3,0,0\n")
+    files = [str(tmp_path / name) for name in ("scene.toml", "own.csv", "scene.toml", "none.csv")]
+    given = ["--noise", "1e-4", "--parameters", "law.mu,law.mu", "--out", str(tmp_path / "out")]  # ends before the fit
+    assert main(["field", *files, *given]) == 2
+    told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("note: ")]
+    assert told == [f"note: {files[1]} has a column sd: --noise is not used for this file"]
+
+
 def test_places_in_another_unit_than_the_displacements_are_refused(tmp_path):
     scene = _scene(tmp_path, mu=1000.0)
     points = np.asarray(scene.mesh.points)

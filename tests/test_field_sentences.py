@@ -28,9 +28,11 @@ def test_a_fit_that_misses_the_data_says_so():
     assert field_report.misfit_sentence(found._replace(chi2=89.0)) is None
     said = field_report.misfit_sentence(found._replace(chi2=0.6))  # a noise that was given in millimetres
     assert said is not None and "scatter 0.1 times as much as the stated noise" in said
+    assert "in metres (--noise), or in the unit of the file (column sd)" in said
     assert field_report.misfit_sentence(found._replace(chi2=0.6), with_mesh=True) is None
     said = field_report.misfit_sentence(found._replace(chi2=240.0))
     assert said is not None and "chi2 stays at 4 per component" in said and "by 2 times their noise" in said
+    assert said.endswith("a larger noise (--noise in metres, or the column sd in the unit of the file)")
     assert field_report.of_numbers(found._replace(chi2=240.0))["warnings"] == [said] and "the mesh's error" not in said
     said = field_report.misfit_sentence(found._replace(chi2=240.0, mesh_over_noise=3.0))
     assert said is not None and "the mesh's error in the data is 3 times the noise: refine the mesh" in said

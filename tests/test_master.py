@@ -343,7 +343,10 @@ def test_twenty_measured_tables_make_one_curve():
     # All sweeps except the three coldest ones, which are glassy, agree with one curve within 1 %.
     assert np.all(found.shifts.misfit[3:] < 0.01)
     wlf = found.laws[0]
-    assert wlf.name == "WLF" and wlf.apart < 0.1
+    assert wlf.name == "WLF" and wlf.apart < 0.05
+    # The guide contains these numbers.
+    assert wlf.numbers["C1"] == pytest.approx((6.93, 0.10), rel=0.05)
+    assert wlf.numbers["C2_K"] == pytest.approx((168.7, 1.5), rel=0.05)
     # For another reference temperature the law is equal if C2 changes by the difference of temperatures (Ferry, 11-22).
     other = master_curve.master_curve(data, 293.15).laws[0]
     apart = found.shifts.temperatures[found.shifts.reference] - 293.15

@@ -10,7 +10,7 @@ from test_time_tests import write
 
 from fitting.__main__ import main
 from fitting.readers.tables.time_columns import read_columns
-from fitting.readers.time_tests import read_time_test
+from fitting.readers.time_tests import Sample, read_time_test
 from liverjax.core.errors import InputError
 
 pytestmark = pytest.mark.quick_to_compile
@@ -135,6 +135,26 @@ def test_errors_of_a_test_in_time_contain_the_size_of_the_sample(sizes, tmp_path
     for name in ("shear_modulus", "equilibrium_modulus"):
         assert total[name] == pytest.approx(np.hypot(size * found[name], noise[name]), rel=1e-6)
     assert total["ratios"] == noise["ratios"] and total["relaxation_times"] == noise["relaxation_times"]
+
+
+@pytest.mark.parametrize(("kind", "power"), [("angle_rad,torque_N.m", 4), ("displacement_m,force_N", 2)])
+def test_a_wrong_radius_counts_twice_for_force_and_four_times_for_torque(kind, power, tmp_path):
+    """Force counted four times too: the total error was 2 % of G0 for a radius of 2 mm, and not 1 %."""
+    t = np.geomspace(0.01, 100, 40)
+    noisy = (500 + 300 * np.exp(-t)) * (1 + 0.002 * np.random.default_rng(0).standard_normal(40))
+    file = write(tmp_path / "t.csv", f"time_s,{kind}", t, np.full(40, 1e-4), 1e-6 * noisy)
+    sizes = ["--radius", "0.002", "--height", "0.02", "--ramp", "0", "--modes", "1", "--out", str(tmp_path)]
+    assert main(["relaxation", str(file), *sizes]) == 0
+    found = json.loads((tmp_path / "fit.json").read_text())
+    relative = found["error_shares"]["geometry"]["shear_modulus"] / found["shear_modulus"]
+    assert relative == pytest.approx(np.hypot(50e-6 / 0.02, power * 10e-6 / 0.002))
+
+
+def test_the_size_of_a_sample_with_a_modulus_is_used_for_the_total_errors(tmp_path):
+    """The note said that the size is not used."""
+    file = write(tmp_path / "t.csv", "time_s,relaxation_modulus_Pa", np.arange(1.0, 9), 500 - np.arange(8.0))
+    (note,) = read_time_test(file, "relaxation", Sample(0.004, 0.002), ramp=0.0).notes
+    assert "does not change the moduli" in note and "used only for the total errors" in note
 
 
 def test_a_strain_in_percent_without_a_unit_is_told(tmp_path):

@@ -238,6 +238,16 @@ def test_an_offset_that_one_row_shows_is_told(tmp_path):
         assert offset == 0 or said[0].startswith(f"the stress is {offset:g} Pa at 0 s, before the load")
 
 
+@pytest.mark.parametrize("rows", [3, 4])
+def test_the_offset_is_subtracted_with_as_many_rows_at_rest_as_the_note_asks_for(rows, tmp_path):
+    """The note asked for three rows before the load. With three, the offset was kept, and the same note came again."""
+    t = np.r_[np.linspace(0.3, 1, rows), 1 + np.geomspace(0.1, 100, 40)]
+    strain, noise = np.where(t > 1, 0.05, 0.0), 1e-3 * np.random.default_rng(3).standard_normal(len(t))
+    write(tmp_path / "t.csv", "time_s,strain,stress_Pa", t, strain, 6 + strain * (500 + 300 * np.exp(-t)) + noise)
+    (note,) = [n for n in read_time_test(tmp_path / "t.csv", "relaxation").notes if "offset" in n]
+    assert ("or give 4 or more rows at rest" if rows < 4 else "the stress of 3 rows at rest is 6 Pa") in note
+
+
 HELD = np.concatenate([np.zeros(200), np.linspace(0, 1, 11)[1:], np.ones(3000)])
 
 

@@ -19,6 +19,8 @@ from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.frequency_sweep import Sweep
 from fitting.readers.time_tests import TimeTest, kind_of
 from fitting.reports import together_report
+from fitting.waves import shear_waves
+from fitting.waves.dispersion import Dispersion
 from liverjax import InputError
 
 pytestmark = pytest.mark.quick_to_compile
@@ -166,6 +168,24 @@ def test_total_errors_contain_the_sizes_of_the_samples():
     # A factor common to both tests changes only G0 and the equilibrium modulus.
     assert shares["geometry"]["shear_modulus"] >= 0.0129 * fit.model.shear_modulus
     assert shares["geometry"]["equilibrium_modulus"] >= 0.0128 * 240
+
+
+def test_each_test_has_the_error_of_its_own_sample_size(tmp_path, capsys):
+    """The factor of force over displacement had the fourth power of the radius, as if it was a torque over twist."""
+    one = TRUTH._replace(ratios=TRUTH.ratios[1:], relaxation_times=TRUTH.relaxation_times[1:])
+    G, small = generalised_maxwell.moduli(one, OMEGA), ["--radius", "0.002", "--height", "0.02"]
+    head = "angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa"
+    np.savetxt(tmp_path / "a.csv", np.column_stack([OMEGA, *G]), delimiter=",", header=head, comments="")
+    at = np.append(0.0, TIME / 100)
+    measured = 1e-4 * 3 * np.pi * 0.002**2 / 0.02 * 800 * (0.6 + 0.4 * np.exp(-at / 0.1))
+    rows = np.column_stack([at, np.full(len(at), 1e-4), measured])
+    np.savetxt(tmp_path / "b.csv", rows, delimiter=",", header="time_s,displacement_m,force_N", comments="")
+    files = [str(tmp_path / "a.csv"), "--with", str(tmp_path / "b.csv")]
+    assert main([*files, *small, "--modes", "1", "--out", str(tmp_path)]) == 0
+    assert "(1 to 2 % of a test's moduli)" in capsys.readouterr().out
+    shares = json.loads((tmp_path / "fit.json").read_text())["error_shares"]["geometry"]
+    force, torque = np.hypot(50e-6 / 0.02, np.array([2, 4]) * 10e-6 / 0.002)
+    assert force < shares["equilibrium_modulus"] / 480 < 0.8 * torque  # a torque in both tests: `torque` or more
 
 
 def test_a_factor_of_all_tests_is_one_of_the_shear_modulus_alone():
@@ -336,6 +356,21 @@ def test_the_largest_error_has_the_divisors_of_the_mean(found):
     cycle = TimeTest("relaxation", time, strain, noisy, time > 0)
     largest = together_report._largest(found._replace(tests=[cycle], fitted=[stress[1:]]))
     assert largest == [together.relative_errors_of(cycle, stress[1:]).max()] and 0.02 < largest[0] < 0.1
+
+
+def test_three_velocities_determine_nothing_alone_and_do_not_disagree():
+    """Directions that no residual determines had no error, and a fit to three values alone seemed to have no noise."""
+    omega, others = np.geomspace(0.2, 300, 25), 2 * np.pi * np.geomspace(50, 400, 3)
+    velocity = shear_waves.velocity_and_attenuation(*generalised_maxwell.moduli(TRUTH, others), others, 1000.0)[0]
+    told = 0
+    for seed in range(4):
+        noise = np.random.default_rng(seed).standard_normal((3, 25))
+        G = [part * (1 + 0.02 * n) for part, n in zip(generalised_maxwell.moduli(TRUTH, omega), noise, strict=False)]
+        waves = Dispersion(others, velocity * (1 + 0.03 * noise[2, :3]), None, 1000.0, "waves.csv")
+        fit = together.fit([Sweep(omega, *G, source="sweep.csv"), waves], 2)
+        assert np.all(np.isinf(fit.shares[0].errors_without[1:]))  # velocities far above the times determine G0
+        told += any("the tests do not agree. The misfit" in w for w in fit.warnings)
+    assert not told
 
 
 def test_what_no_fit_follows_is_told():

@@ -46,7 +46,7 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
     if not found:
         raise InputError(f"{path}: no table has a strain column (unit % or 1); add this column")
     place, notes = choose_table(str(path), found, table, "strains", lambda t: len(np.unique(t.raw["strain"])))
-    chosen = found[place]
+    chosen, notes = found[place], [*notes, *found[place].notes]
     columns = {c.quantity: (c, j) for j, c in reversed(list(enumerate(chosen.columns)))}
     rows = np.asarray(chosen.rows)
     in_si = {q: (c, column_in_si(str(path), c, rows[:, j], notes)) for q, (c, j) in columns.items()}

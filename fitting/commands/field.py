@@ -76,7 +76,9 @@ def _problem(options: argparse.Namespace) -> Problem:
     for scene_file, data_file in zip(options.files[::2], options.files[1::2], strict=True):
         scene = load_scene(scene_file)
         scenes.append(scene)
-        data.append(read_displacements(data_file, scene, options.noise, options.unit))
+        data.append(own := read_displacements(data_file, scene, options.noise, options.unit))
+        if options.noise is not None and np.any(np.isfinite(own.sd) & (own.sd != options.noise)):
+            print(f"note: {data_file} has a column sd: --noise is not used for this file", file=sys.stderr)
     return Problem(tuple(scenes), tuple(data))
 
 

@@ -127,7 +127,7 @@ def run(options: argparse.Namespace) -> int:
     if options.file.suffix.lower() != ".toml":  # this error is only for tests in a rheometer
         default = Simulation()
         rig = Simulation(radius=options.radius or default.radius, height=options.height or default.height)
-        found.details["geometry_error"] = total_error.of_geometry(rig, None)
+        found.details["geometry_error"] = total_error.of_geometry(rig, None, test.axial)
     posterior = None
     if options.samples and shared_options.has_draws(found.kind):
         from fitting.fits.posterior import of_time_test

@@ -5,6 +5,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from fitting.commands import shared_options
 from fitting.commands.progress import named_bar
 from liverjax.core.errors import InputError
@@ -18,6 +20,7 @@ def run(options: argparse.Namespace) -> int:
     from fitting.fits.families import springpots_in_time
     from fitting.fits.honesty import total_error
     from fitting.fits.simulated_rheometer import Simulation
+    from fitting.readers.time_tests import TimeTest
     from fitting.reports import together_report
     from liverjax.core.files import writable
 
@@ -30,7 +33,8 @@ def run(options: argparse.Namespace) -> int:
     writable(options.out, ("fit.json", "fit.png"))
     default = Simulation()
     rig = Simulation(radius=options.radius or default.radius, height=options.height or default.height)
-    relative = total_error.of_geometry(rig, None)
+    axial = [isinstance(test, TimeTest) and test.axial for test in tests]
+    relative = np.array([total_error.of_geometry(rig, None, each) for each in axial])
     with named_bar(f"{len(tests)} tests") as told:
         found = springpots_in_time.choose_together(tests, options.model, options.modes, told, relative)
     together_report.write(options.out, found, relative, options.density)

@@ -531,9 +531,11 @@ def shares_by_rows(
         r, (_, y, scales) = alone(k)[: sum(counts)][place[: sum(counts)] == k], reported_numbers(fit.tests[k])
         freedom, errors = counts[k] - min(free, counts[k] / 2), relative_errors_of(fit.tests[k], y + r * scales)
         unknown = ~(without < 1e3 * np.abs(values))
+        # A fit with as many parameters as values follows the noise, so its residuals do not show the noise.
+        least = least_noise if counts[k] - free >= LEAST_FREEDOM else first_noise
         out.append(
             share._replace(
-                alone=max(least_noise(fit.tests[k]), _size_of_noise(r, freedom)),
+                alone=max(least(fit.tests[k]), _size_of_noise(r, freedom)),
                 misfit_alone=_size_of_noise(errors, freedom * len(errors) / counts[k]),
                 errors_without=np.where(unknown, np.inf, without),
             )

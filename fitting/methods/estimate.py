@@ -126,7 +126,9 @@ def spread(jacobian: np.ndarray, noise: float, to_natural: np.ndarray) -> tuple[
     if not (np.all(np.isfinite(jacobian)) and np.any(jacobian)):  # the fit could not begin: all errors are infinite
         return np.full((len(to_natural), jacobian.shape[1]), np.inf), np.zeros(min(jacobian.shape))
     scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
-    _, s, Vt = np.linalg.svd(jacobian / scale, full_matrices=False)
+    # Fewer residuals than unknowns leave directions that no residual determines: they need rows, too.
+    missing = np.zeros((max(0, jacobian.shape[1] - len(jacobian)), jacobian.shape[1]))
+    _, s, Vt = np.linalg.svd(np.vstack([jacobian / scale, missing]), full_matrices=False)
     # A direction that the data do not determine gets 1e14 times the error of the best determined direction. An infinite
     # error would give infinity times zero.
     with np.errstate(over="ignore", invalid="ignore"):  # a parameter that diverged has no finite error

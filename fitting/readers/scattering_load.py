@@ -1,4 +1,5 @@
-"""Remove the scatter of a measured strain or stress if the true load is constant or a linear ramp."""
+"""Remove the scatter of a measured load (strain, stress, displacement or force), if the true load is constant or a
+linear ramp."""
 
 import numpy as np
 
@@ -12,8 +13,8 @@ _FEW_ROWS, _RAMP = 10, 3.0
 
 
 def without_scatter(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[np.ndarray, list[str]]:
-    """Return the imposed strain or stress without scatter, and notes. A constant load is replaced by its mean, and a
-    linear ramp by a fitted straight line. `word`: "strain" or "stress", for the notes.
+    """Return the imposed load without scatter, and notes. A constant load is replaced by its mean, and a linear ramp by
+    a fitted straight line. `word`: name of the load, for example "strain", for the notes.
 
     The model treats every change between two readings as a real change of the load. So it would also treat the scatter
     of a sensor as a change of the load.

@@ -50,6 +50,7 @@ class TimeTest(NamedTuple):
     # Standard deviation of the rounding errors of the responses, 0 if they are not rounded. It is found before the base
     # line is subtracted, because rows with the same response differ after a drift is subtracted.
     rounding: float = 0.0
+    axial: bool = False  # whether the file has columns of displacement and force
 
     @property
     def scales(self) -> np.ndarray:
@@ -157,7 +158,10 @@ def read_time_test(
         notes += _another_course(str(path), kind, time, columns[form[0]], (ramp or 0.0, start))
         time, driven, answer = _as_a_step(str(path), time, columns[form[0]], ramp or 0.0)
         if sample.radius is not None or sample.height is not None:
-            notes.append(f"the size of the sample is not used, because the file has a column of {form[0]}")
+            notes.append(
+                f"the size of the sample does not change the moduli, because the file has a column of {form[0]}: it is "
+                "used only for the total errors"
+            )
         if ramp is None:
             word = "strain" if kind == "relaxation" else "stress"
             notes.append(
@@ -170,9 +174,12 @@ def read_time_test(
         notes += told
         notes += _of_the_other_kind(kind, time, strain, stress)
         driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
-        rows = from_rest(time, driven, answer, ramp, (str(path), "--ramp"))
-        test = of_columns(kind, *rows[:3], (str(path), [*notes, *rows[3]]), start)
-        return with_known_rise(test, time, driven, ramp)
+        own_time, own_drive = time, driven
+        time, driven, answer, told = from_rest(time, driven, answer, ramp, (str(path), "--ramp"))
+        driven, scatter = without_scatter(time, driven, "strain" if kind == "relaxation" else "stress")
+        test = of_columns(kind, time, driven, answer, (str(path), [*notes, *told, *scatter]), start)
+        test = with_known_rise(test, own_time, own_drive, ramp)
+        return test._replace(axial=form == ("displacement", "force"))
     test = TimeTest(kind, time, driven, answer, time > 0, str(path), tuple(notes))
     return _checked(test._replace(rise=GIVEN), start)
 
@@ -190,7 +197,8 @@ def of_columns(
     Args:
         kind: "relaxation" or "creep".
         time: (n,) [s], rising from 0.
-        driven, answer: (n,) strain and stress [Pa]; in creep, stress [Pa] and strain.
+        driven, answer: (n,) strain and stress [Pa]; in creep, stress [Pa] and strain. The scatter of `driven` was
+            removed before (see `without_scatter`).
         source: name of the file, and notes.
         start: responses before this time [s] are not fitted.
 
@@ -200,8 +208,7 @@ def of_columns(
     """
     if np.any(np.diff(time) < 0):
         raise InputError(f"{source[0]}: the times do not ascend; sort the rows by time")
-    driven, told = without_scatter(time, driven, "strain" if kind == "relaxation" else "stress")
-    told += _ringing(time, driven, answer, start) if kind == "creep" else []
+    told = _ringing(time, driven, answer, start) if kind == "creep" else []
     return _checked(TimeTest(kind, time, driven, answer, time > 0, source[0], (*source[1], *told)), start)
 
 
@@ -478,14 +485,14 @@ def _without_base_line(test: TimeTest) -> tuple[TimeTest, list[str]]:
     what, unit = ("stress", " Pa") if test.kind == "relaxation" else ("strain", "")
     if line.slope:
         told = (
-            f"the {what} of the {count} rows before the load changes steadily, by {line.slope:.3g}{unit} per second: "
+            f"the {what} of {count} rows at rest changes steadily, by {line.slope:.3g}{unit} per second: "
             f"the sensor drifts. This straight line is subtracted from all rows: {line.level:.3g}{unit} at the "
             f"beginning of the load, {line.level + line.slope * time[-1]:.3g}{unit} at the end of the test. Nothing "
             "shows how the drift continues under load, so the errors allow for half of it"
         )
     else:
         told = (
-            f"the {what} of the {count} rows before the load is {line.level:.3g}{unit} on average, which is "
+            f"the {what} of {count} rows at rest is {line.level:.3g}{unit} on average, which is "
             f"{100 * abs(line.level) / size:.2g} % of the largest {what} (absolute value): this sensor offset is "
             "subtracted"
         )
@@ -501,8 +508,9 @@ def _without_base_line(test: TimeTest) -> tuple[TimeTest, list[str]]:
 
 
 def _of_one_row_at_rest(test: TimeTest, size: float) -> list[str]:
-    """Return a note if the response at the start of the load is not 0. With only one or two rows before the load, an
-    offset cannot be distinguished from noise."""
+    """Return a note if the response at the start of the load is not 0. With too few rows at rest, an offset
+    cannot be distinguished from noise. The last of these rows is the beginning of the load, so RESTING + 1 rows are
+    enough."""
     k = int(np.argmax(test.time >= test.begun))
     here, load = float(test.answer[k]), abs(float(test.driven[k])) / float(np.max(np.abs(test.driven)))
     noise = noise_of_series(test.answer[np.isfinite(test.answer) & (test.time > test.begun)])
@@ -513,7 +521,7 @@ def _of_one_row_at_rest(test: TimeTest, size: float) -> list[str]:
     return [
         f"the {what} is {here:.3g}{unit} at {test.time[k]:.3g} s, before the load. This is "
         f"{100 * abs(here) / size:.2g} % of the largest {what} (absolute value). If this is an offset of the sensor, "
-        f"all moduli are wrong: subtract this {what} from all rows, or give {RESTING} or more rows before the load"
+        f"all moduli are wrong: subtract this {what} from all rows, or give {RESTING + 1} or more rows at rest"
     ]
 
 

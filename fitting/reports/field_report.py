@@ -44,8 +44,8 @@ def misfit_sentence(found: Estimate, with_mesh: bool = False) -> str | None:
     if ratio < TOO_NEAR and found.components >= FEW and not with_mesh:
         return (
             f"chi2 is {ratio:.3g} per component, so the displacements scatter {np.sqrt(ratio):.2g} times as much as "
-            "the stated noise, and the errors are too large. Give the noise (--noise) in metres, also if the file has "
-            "another unit"
+            "the stated noise, and the errors are too large. Give the noise in metres (--noise), or in the unit of "
+            "the file (column sd)"
         )
     if not ratio > TOO_FAR:
         return None
@@ -66,7 +66,7 @@ def misfit_sentence(found: Estimate, with_mesh: bool = False) -> str | None:
         )
     return (
         f"{said}; check the unit (--unit), the origin of the coordinates, node numbers (from 0), rows of zeros, "
-        "loads and supports, or give a larger --noise"
+        "loads and supports, or give a larger noise (--noise in metres, or the column sd in the unit of the file)"
     )
 
 

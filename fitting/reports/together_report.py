@@ -36,15 +36,15 @@ QUANTITIES = {
 }
 
 
-def write(out: Path, found: Together, relative: float, density: float | None = None) -> Content:
+def write(out: Path, found: Together, relative: float | np.ndarray, density: float | None = None) -> Content:
     """Write fit.json and fit.png. Return the content of fit.json, which has the same keys as for a sweep, and the key
     `tests`.
 
     Args:
         out: folder.
         found: the fit.
-        relative: relative error of the moduli of a test due to the size of its sample, common to all moduli of the
-            test.
+        relative: relative errors (K,) of the moduli of the K tests due to the sizes of their samples, common to all
+            moduli of a test; or one number for all tests.
         density: density of the material [kg/m^3]; None: the density of the shear waves among the tests, if any.
     """
     out.mkdir(parents=True, exist_ok=True)
@@ -84,7 +84,7 @@ def write(out: Path, found: Together, relative: float, density: float | None = N
     return content
 
 
-def _total_errors(found: Together, relative: float) -> Content:
+def _total_errors(found: Together, relative: float | np.ndarray) -> Content:
     shares = sizes_of_samples.shares_with_sizes(found, relative)
     whole = total_error.root_of_squares(shares)
     return {"total_errors": by_stem(whole), "error_shares": {source: by_stem(part) for source, part in shares.items()}}
@@ -135,7 +135,7 @@ def _largest(found: Together) -> list[float]:
     return [float(relative_errors_of(*pair).max()) for pair in zip(found.tests, found.fitted, strict=True)]
 
 
-def table(found: Together, relative: float) -> str:
+def table(found: Together, relative: float | np.ndarray) -> str:
     """Return a table of parameters ± standard error, the standard errors of fits that omit one test each, and the total
     error of the first parameter."""
     u, n, own = found.uncertainty, found.modes, found.parameters
@@ -168,7 +168,7 @@ def table(found: Together, relative: float) -> str:
     return "\n".join(rows)
 
 
-def _with_sizes(found: Together, relative: float) -> list[str]:
+def _with_sizes(found: Together, relative: float | np.ndarray) -> list[str]:
     """Return a line with the total error of the first parameter. Another parameter is added if its error due to the
     sizes of the samples is not below its error due to noise. If there are several such parameters, the one with the
     largest ratio of these errors is added."""
@@ -176,8 +176,9 @@ def _with_sizes(found: Together, relative: float) -> list[str]:
     whole, names = total_error.root_of_squares(shares), list(shares["noise"])
     if not names or not np.isfinite(whole[names[0]]):
         return []
+    sizes = dict.fromkeys(f"{100 * one:.2g}" for one in (np.min(relative), np.max(relative)))
     told = (
-        f"{names[0]} with the errors of the sample sizes ({100 * relative:.2g} % of a test's moduli): ± "
+        f"{names[0]} with the errors of the sample sizes ({' to '.join(sizes)} % of a test's moduli): ± "
         f"{whole[names[0]]:.2g}"
     )
     known = [n for n in names[1:] if 0 < shares["noise"][n] < np.inf]

@@ -22,6 +22,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.ndimage
 
+from fitting.readers.noise_of_series import noise_of_series
+from fitting.readers.scattering_load import without_scatter
 from fitting.readers.tables.time_columns import read_columns
 from fitting.readers.time_tests import TimeTest, from_rest, of_columns, with_known_rise
 from fitting.rigs import glued, thin_layer
@@ -50,9 +52,14 @@ _GRID, _FINER_GRID, _LARGE = (0.05, 0.5, 1.0), (0.05, 0.25, 0.5, 0.75, 1.0), 0.1
 #: Sizes of the cells at the rims of the plates, divided by the shortest dimension of the sample there. The simulation
 #: is tried with the small cells first. They are more accurate, but may invert at large compression.
 _RIMS = (0.04, 0.1, 0.2)
-#: An indenter counts as going back if its depth falls by more than both _BACK times the largest depth and _SCATTERS
-#: times the scatter of the depth.
-_BACK, _SCATTERS = 0.02, 4.0
+#: An indenter counts as going back if a running median of its depth falls by more than _BACK times the largest depth.
+_BACK = 0.02
+#: The fall must also exceed the falls that the scatter of the depth causes. The limit is the largest expected deviation
+#: of a row, times _FALL for a median over _ROWS rows. For a median over more rows, the limit is _FALL_WIDE times this
+#: deviation, divided by the root of the number of rows. The values were found with simulated scatter.
+_ROWS, _FALL, _FALL_WIDE = 5, 1.5, 3.0
+#: The median over more rows covers at most the fraction _WIDE of the rows, and at most _WIDEST rows.
+_WIDE, _WIDEST = 0.05, 500
 #: Minimum number of rows in which the contact grows, including the row at rest.
 _FEWEST = 6
 #: Maximum number of rows of an indenter's test, including the rows that are added between the measured rows.
@@ -117,34 +124,64 @@ def read_described(path: str | Path) -> TimeTest:
     first, then = (d, force) if described.drive == "displacement" else (force, d)
     ramp, (own_time, own_drive) = 0.0 if described.at_once else None, (columns["time"], first)
     time, first, then, told_of_start = from_rest(own_time, first, then, ramp, (str(described.data), "ramp"))
-    d, force = (first, then) if described.drive == "displacement" else (then, first)
-    if described.test in ("sphere", "cone"):
-        kept, told_of_way = _while_contact_grows(time, sign * d)
-        if kept < _FEWEST:
-            raise InputError(
-                f"{described.data}: the indenter goes back from {time[kept]:.4g} s on, after {kept} rows; give a test "
-                "that begins with an indentation"
-            )
-        time, d, force, told = time[:kept], d[:kept], force[:kept], [*told, *told_of_way]
-    if described.test in ("sphere", "cone") and described.drive == "displacement":
-        time, d, force = _with_more_between(time, d, force)
+    (time, d, force), told_of_rows = _rows_to_fit(described, (time, first, then), sign)
     # Without contact, an indenter has no force.
     moved = sign * d if "height" in described.sizes else np.maximum(sign * d, 0.0)
     strain, stress = curve_of(curve, moved) / section, sign * force / section
     kind = _KINDS[described.drive]
     driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
-    notes = [*notes, *told, *told_of_start]
+    notes = [*notes, *told, *told_of_start, *told_of_rows]
     test = of_columns(kind, time, driven, answer, (str(path), notes), described.min_time)
     return with_known_rise(test, own_time, own_drive, ramp)._replace(described=True)
+
+
+def _rows_to_fit(
+    described: Described, rows: tuple[np.ndarray, np.ndarray, np.ndarray], sign: float
+) -> tuple[tuple[np.ndarray, ...], list[str]]:
+    """Return time, displacement and force of the rows that are fitted, and notes. The imposed quantity has no scatter.
+    For sphere and cone, rows are left out after the indenter goes back, and rows are added between the others.
+
+    Args:
+        described: the description of the test.
+        rows: time, imposed quantity and response (n,).
+        sign: sign of the displacement that loads the sample.
+
+    Raises:
+        InputError: the indenter goes back almost from the beginning.
+    """
+    time, first, then = rows
+    by_displacement = described.drive == "displacement"
+    notes: list[str] = []
+    if described.test in ("sphere", "cone"):
+        kept, notes = _while_contact_grows(time, sign * (first if by_displacement else then))
+        if kept < min(_FEWEST, len(time)):
+            raise InputError(
+                f"{described.data}: the indenter goes back from {time[kept]:.4g} s on, after {kept} rows; give a test "
+                "that begins with an indentation"
+            )
+        time, first, then = time[:kept], first[:kept], then[:kept]
+    # The added rows lie on straight lines. Among them, the scatter of the measured rows would not be found.
+    first, told = without_scatter(time, first, described.drive)
+    d, force = (first, then) if by_displacement else (then, first)
+    if described.test in ("sphere", "cone") and by_displacement:
+        time, d, force = _with_more_between(time, d, force)
+    return (time, d, force), [*notes, *told]
 
 
 def _while_contact_grows(time: np.ndarray, depth: np.ndarray) -> tuple[int, list[str]]:
     """Return the number of rows before the indenter goes back, and a note if it goes back. While the contact shrinks,
     another formula is valid for the force (Ting 1966, J. Appl. Mech. 33:845)."""
-    depth = scipy.ndimage.median_filter(np.maximum(depth, 0.0), 5, mode="nearest")  # removes single low values
-    scatter = 1.4826 * float(np.median(np.abs(np.diff(depth, 2)))) / np.sqrt(6) if len(depth) > 2 else 0.0
-    fall = np.maximum.accumulate(depth) - depth
-    back = fall > max(_BACK * float(depth.max()), _SCATTERS * scatter)
+    depth = np.maximum(depth, 0.0)
+    # The largest of n values with Gaussian noise is expected at sqrt(2 ln(n)) standard deviations.
+    deviation = noise_of_series(depth) * np.sqrt(2 * np.log(len(depth)))
+    smooth = scipy.ndimage.median_filter(depth, _ROWS, mode="nearest")  # removes single low values
+    least = _BACK * float(smooth.max())
+    back = np.maximum.accumulate(smooth) - smooth > max(least, _FALL * deviation)
+    # A median over more rows finds smaller falls. With `needed` rows, the falls due to scatter are below `least`.
+    needed = (_FALL_WIDE * deviation / max(least, 1e-300)) ** 2
+    rows = int(np.clip(needed, _ROWS, max(_ROWS, min(_WIDE * len(depth), _WIDEST)))) | 1  # an odd number
+    smooth = scipy.ndimage.median_filter(depth, rows, mode="reflect")
+    back |= np.maximum.accumulate(smooth) - smooth > max(least, _FALL_WIDE * deviation / np.sqrt(rows))
     if not back.any():
         return len(time), []
     kept = int(np.argmax(back))

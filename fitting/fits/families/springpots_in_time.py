@@ -279,12 +279,13 @@ def choose_together(
     model: str,
     modes: int | str = "auto",
     progress: Callable[[str], None] = lambda text: None,
-    relative: float = 0.0,
+    relative: float | np.ndarray = 0.0,
 ) -> Together:
     """Return the fit of several tests with the lowest information criterion. The arguments `model` and `modes` are
     those of `choose_in_time`, and `progress` is that of `together.fit`.
 
-    `relative`: relative error of all moduli of a test due to the size of its sample.
+    `relative`: relative errors (K,) of all moduli of the K tests due to the sizes of their samples, or one number for
+    all tests.
     """
     tests = [_by_its_noise(test) for test in tests]
     prony = together.fit(tests, modes, progress)

@@ -21,13 +21,15 @@ from fitting.methods.least_squares import Solution, from_starts
 CERTAIN, LEAST = 4.0, 0.005
 
 
-def told(fit: Together, relative: float = 0.0) -> list[str]:
+def told(fit: Together, relative: float | np.ndarray = 0.0) -> list[str]:
     """Return a warning that names the test and the factor that make all tests agree. There is no warning if the tests
     agree already, or if no factor makes them agree.
 
     The ratios and relaxation times of a common fit can compensate a factor of a few percent. The common fit then fits
-    each test nearly as well as a separate fit does. A small factor may come from wrong sizes of the samples. `relative`
-    is the relative error of the moduli of each test due to the size of its sample.
+    each test nearly as well as a separate fit does. A small factor may come from wrong sizes of the samples.
+
+    `relative`: relative errors (K,) of the moduli of the K tests due to the sizes of their samples, or one number for
+    all tests.
     """
     if fit.kind.effective is not None:
         return []
@@ -41,7 +43,8 @@ def told(fit: Together, relative: float = 0.0) -> list[str]:
         f"the tests agree if all moduli of {fit.shares[k].source or fit.shares[k].name} are {factor:.3g} ± {error:.1g} "
         "times the moduli of the other tests: "
     )
-    if abs(np.log(factor)) < 2 * np.sqrt(2) * relative:
+    sizes = np.broadcast_to(relative, len(fit.tests))
+    if abs(np.log(factor)) < 2 * np.hypot(sizes[k], np.delete(sizes, k).max()):
         return [
             said + "errors in the sizes of the samples explain this factor, and the total errors contain these errors"
         ]

@@ -1,8 +1,8 @@
 """Errors of the parameters of several tests due to errors in the sizes of the samples.
 
-Torque divided by twist is G pi R^4 / (2 h) for the shear modulus G, so a wrong gap h or radius R multiplies all moduli
-of a test by a factor. If only one test is fitted, this factor changes only G0. If tests with different factors are
-fitted together, ratios and relaxation times change too.
+A wrong gap or radius multiplies all moduli of a test by a factor (see `total_error.of_geometry`). If only one test is
+fitted, this factor changes only G0. If tests with different factors are fitted together, ratios and relaxation times
+change too.
 """
 
 from functools import partial
@@ -16,13 +16,13 @@ from fitting.methods.estimate import with_slope
 from fitting.waves.dispersion import Dispersion
 
 
-def shares_with_sizes(fit: Together, relative: float) -> dict[str, dict[str, float]]:
+def shares_with_sizes(fit: Together, relative: float | np.ndarray) -> dict[str, dict[str, float]]:
     """Return the errors of each parameter due to noise and due to the sizes of the samples. The strengths of a spectrum
     are not included.
 
     Args:
         fit: the common fit.
-        relative: relative standard deviation of the factor of a test, see `total_error.of_geometry`.
+        relative: relative standard deviations (K,) of the factors of the K tests, or one number for all tests.
     """
     own = fit.uncertainty if fit.parameters is None else fit.parameters
     names = [n for n in own.names if not n.startswith("strengths[")]

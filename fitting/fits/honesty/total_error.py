@@ -19,14 +19,19 @@ from fitting.methods.uncertainty import equilibrium_change
 GAP, RADIUS = 50e-6, 10e-6
 
 
-def of_geometry(simulation: Simulation, gap_error: float | None) -> float:
-    """Return the relative error of all moduli due to the size of the sample between the plates. Torque divided by twist
-    is G pi R^4 / (2 h) for the shear modulus G, the radius R and the gap h.
+def of_geometry(simulation: Simulation, gap_error: float | None, axial: bool = False) -> float:
+    """Return the relative error of all moduli due to the size of the sample between the plates.
 
-    `gap_error`: standard deviation [m] of the gap; None: `GAP`.
+    Torque divided by twist is G pi R^4 / (2 h) for the shear modulus G, the radius R and the gap h. Force divided by
+    displacement is 3 G pi R^2 / h.
+
+    Args:
+        simulation: the radius and the gap.
+        gap_error: standard deviation [m] of the gap; None: `GAP`.
+        axial: whether force and displacement were measured, instead of torque and twist.
     """
-    gap = GAP if gap_error is None else gap_error
-    return float(np.hypot(gap / simulation.height, 4 * RADIUS / simulation.radius))
+    gap, power = GAP if gap_error is None else gap_error, 2 if axial else 4
+    return float(np.hypot(gap / simulation.height, power * RADIUS / simulation.radius))
 
 
 def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
