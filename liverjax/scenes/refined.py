@@ -86,7 +86,7 @@ def on_refined_mesh(scene: Scene) -> tuple[Scene, Within]:
     Numbers of the scene may be unknown (inside jit, grad or vmap), but node numbers must be known.
 
     Raises:
-        InputError: the positions of the mesh are unknown inside `jax.jit`.
+        InputError: the node numbers of the mesh are unknown inside `jax.jit`.
     """
     old, E = scene.mesh, scene.mesh.number_of_elements
     mesh, within = _mesh_and_within(old)
@@ -126,13 +126,13 @@ def on_refined_mesh(scene: Scene) -> tuple[Scene, Within]:
 def _mesh_and_within(old: TetMesh) -> tuple[TetMesh, Within]:
     """Return the refined mesh, and the positions of its nodes in the old mesh."""
     traced = isinstance(old.points, jax.core.Tracer)
+    if isinstance(old.tetrahedra, jax.core.Tracer) or isinstance(old.pattern.edges, jax.core.Tracer):
+        raise InputError(
+            "the mesh error of a scene with a fluid cannot be estimated inside jax.jit if the mesh is an argument of "
+            "the compiled function: estimate the error outside jax.jit"
+        )
     with nullcontext() if traced else jax.ensure_compile_time_eval():  # the node numbers must be known
         mesh = refined(replace(old, triangle_sets=None))
-        if isinstance(mesh.pattern.edges, jax.core.Tracer):
-            raise InputError(
-                "the mesh error of a scene with a fluid cannot be estimated inside jax.jit if the positions of the "
-                "mesh are unknown there: estimate the error outside jax.jit"
-            )
         element, place = places_in(old, mesh)
         nodes, values = weights(old, element, place)
         return mesh, Within(nodes=node_numbers(nodes), weights=jnp.asarray(values))
