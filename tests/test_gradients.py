@@ -69,7 +69,7 @@ def _leaves(scene: lj.Scene) -> dict:
         names += [f"porosity.{n}" for n in ("bulk", "limit_bulk", "fluid_fraction", "permeability")]
     names += ["solve.dt"] if scene.solve.dt is not None else []
     names += ["traction.0.pressure" if lj.boundary.follows(scene.traction) else "traction.0.value"]
-    if scene.solve.kind == "static" and (scene.porosity is None or scene.porosity.scheme == "lagged"):
+    if scene.solve.kind == "static":
         names.remove("start")  # the equilibrium does not depend on its starting point
     return {name: _value(scene, name) for name in names} | {"law.mu": jnp.full(scene.mesh.number_of_elements, 770.0)}
 
