@@ -117,6 +117,7 @@ def verified(record_property):
 def pytest_configure(config):
     """Share compiled programs with the other test process and with commands that tests start."""
     config.addinivalue_line("markers", "slow: run by python -m pytest -m slow, not by default")
+    config.addinivalue_line("markers", "ci: takes some seconds; run by .ci/run and by -m 'not slow', not by default")
     config.addinivalue_line("markers", "core: each public entry once, for other versions of Python and jax: -m core")
     config.addinivalue_line("markers", "draws: its pictures are drawn; those of other tests are files of one point")
     config.addinivalue_line("markers", "quick_to_compile: few optimisations, where compiling takes longer than running")

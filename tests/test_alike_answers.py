@@ -34,6 +34,7 @@ def _autoregression(rng: np.random.Generator, n: int, part: float) -> np.ndarray
     return out
 
 
+@pytest.mark.ci
 def test_errors_of_shared_noise_are_those_of_many_draws():
     """The errors under drifting noise are those of many draws. If the noise were taken as independent, the errors of
     ratios and times would be 2 to 5 times too small.
@@ -186,6 +187,7 @@ def test_noise_of_constant_size_sets_the_weights_beside_a_sweep():
     assert both.tests[1].constant_noise and both.shares[1].noise < 0.05
 
 
+@pytest.mark.ci
 def test_errors_contain_the_error_of_a_subtracted_offset(tmp_path):
     """Four rows at rest determine the offset of the sensor. Without its error, the equilibrium modulus scattered by 3.5
     standard errors, and a quarter of the intervals contained the truth.
@@ -255,6 +257,7 @@ def test_the_error_of_equal_rows_at_rest_is_their_rounding(tmp_path):
     assert np.isclose(reader.read_time_test(tmp_path / "t.csv", "relaxation").offset_error, 0.5 / np.sqrt(12))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("rate", [0.01, pytest.param(-0.01, marks=pytest.mark.slow)])
 def test_a_drift_of_the_sensor_is_subtracted(rate, tmp_path):
     """The mean of the rows before the load was subtracted as an offset, although the sensor drifted. The equilibrium

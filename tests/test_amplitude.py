@@ -104,6 +104,7 @@ def tanned():
     return law, law_fit.Memory().of(2 * np.pi), jnp.array([1.0, 0.2])
 
 
+@pytest.mark.ci
 def test_a_law_and_its_loss_come_back(tmp_path, tanned):
     law, memories, shares = tanned
     sweep = strain_sweep.read_strain_sweep(written(tmp_path / "a.csv", law, memories, 0.0, shares))

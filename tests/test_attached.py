@@ -199,6 +199,7 @@ def test_slack_fibres_hold_nothing(rest, holds):
 # -- vessels ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_vessel_in_a_stretched_body_pulls_as_a_bar(order):
     """In a uniform deformation every piece has the stretch |F t|, so energy and force are those of one straight bar."""

@@ -75,6 +75,7 @@ def test_linear_bodies_agree_with_ours_where_strains_are_small(body, integrator)
     assert np.log2(apart[1] / apart[0]) == pytest.approx(2, abs=0.3)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("name", [pytest.param("mooney_rivlin", marks=pytest.mark.slow), "arruda_boyce"])
 @pytest.mark.parametrize(
     "way", [*(pytest.param(way, marks=pytest.mark.slow) for way in ("chapter", "standard")), "autodiff"]

@@ -223,6 +223,7 @@ steps = 7
 """
 
 
+@pytest.mark.ci
 def test_they_stand_in_the_report_and_in_the_results(tmp_path, capsys):
     (tmp_path / "scene.toml").write_text(SCENE)
     assert main(["simulate", str(tmp_path / "scene.toml"), "--out", str(tmp_path)]) == 0

@@ -168,6 +168,7 @@ MISTAKES = {
 FIRST = ("wrong sign", "NaN at rest")
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("mistake", [m if m in FIRST else pytest.param(m, marks=pytest.mark.slow) for m in MISTAKES])
 def test_planted_mistakes_are_caught(mistake, tmp_path, capsys, monkeypatch):
     body, row = MISTAKES[mistake]
@@ -181,6 +182,7 @@ def test_planted_mistakes_are_caught(mistake, tmp_path, capsys, monkeypatch):
     assert "FAILED" in output.out
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     "steep",
     [
@@ -235,6 +237,7 @@ def test_a_number_that_is_forgotten_in_the_energy_is_named(tmp_path, capsys):
     assert row.split()[3:5] == ["FAILED", "more"]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     "stated, agrees",
     [
@@ -290,6 +293,7 @@ def test_a_law_that_no_scene_can_use_gets_one_sentence(words, tmp_path, capsys):
     assert words in capsys.readouterr().err
 
 
+@pytest.mark.ci
 @pytest.mark.draws
 @pytest.mark.parametrize(
     "name", ["saint_venant_kirchhoff", *(pytest.param(n, marks=pytest.mark.slow) for n in ("neo_hookean", "costa"))]

@@ -41,6 +41,7 @@ def _contract(content: dict, modes: int) -> None:
     assert {"jax", "numpy", "liverjax"} <= set(content["versions"])
 
 
+@pytest.mark.ci
 @pytest.mark.draws
 def test_main_job_as_a_new_user(tmp_path):
     """Run the README's command on the model-implied sweep: through the simulation, with the closed form for
@@ -299,6 +300,7 @@ def test_laws_lists_every_parameter(capsys):
     assert "arruda_boyce" in out and "chain_length" in out and "[Pa]  > 0" in out
 
 
+@pytest.mark.ci
 def test_a_run_in_single_precision_writes_its_files(tmp_path):
     """A scene in single precision keeps its mesh in double precision. Combined values have the precision of the
     mesh.
@@ -324,6 +326,7 @@ def test_a_run_in_single_precision_writes_its_files(tmp_path):
     assert np.isclose(float(last["support.0.z_N"]), 3.0, rtol=1e-3)
 
 
+@pytest.mark.ci
 def test_numbers_with_exponents_are_values_and_an_unknown_backend_is_no_matter(tmp_path):
     """argparse took `--gap-error -1e-5` for an unknown option; a wrong MPLBACKEND ended in a traceback."""
     command = [sys.executable, "-m", "fitting", str(PORCINE), "--method", "closed-form", "--out", str(tmp_path)]

@@ -32,6 +32,7 @@ def plate(aspect: float, cells: int = 4, order: int = 1, **solve) -> lj.Scene:
     )
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("order", [1, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3))])
 def test_blocks_are_the_inverse_of_the_tangents(order):
     scene = plate(10.0, cells=2 if order > 1 else 4)

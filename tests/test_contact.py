@@ -65,6 +65,7 @@ def lying(order: int = 1, **changes) -> lj.Scene:
     return lj.Scene(mesh=mesh, law=LAW, fixed=sides, traction=(push,), physics=(plane,), solve=lj.Solve(**changes))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_pressed_cube_sinks_by_pressure_over_stiffness(order):
     scene = lying(order)
@@ -194,6 +195,7 @@ def test_gradients_through_closing_contact():
         assert min(errors) < 1e-6
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("precision", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_forces_on_obstacles_know_regions_and_precision(precision):
     """The default contact stiffness follows from the stiffest law of the body, as in the run, so the forces balance."""

@@ -36,6 +36,7 @@ def plane(scene: lj.Scene, **given) -> Obstacle:
     return kind(triangles=top, axis=jnp.array([0.0, 0.0, -1.0]), **given)
 
 
+@pytest.mark.ci
 def test_a_still_obstacle_gives_no_energy():
     """A plane presses the block for 0.1 s and stops. When the mean of the contact forces at both ends of a step was
     used, the block got 600 times its energy, although every step converged.
@@ -56,6 +57,7 @@ def test_a_still_obstacle_gives_no_energy():
     assert np.isclose(np.asarray(result.reactions)[100:, :, 2].sum(axis=1).mean(), force, rtol=0.02)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("side", "by", "mass"),
     [
@@ -99,6 +101,7 @@ def test_an_obstacle_gives_a_body_with_a_rigid_plate_no_energy(side, by, mass):
     assert np.allclose(np.diff(momentum) / dt - weight, -contact, atol=1e-6 * contact.max())
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("order", "mass"),
     [

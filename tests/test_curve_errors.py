@@ -110,6 +110,7 @@ def test_numbers_of_the_other_sign_that_shear_cannot_tell_apart_are_told():
     assert not [s for s in every if s.startswith("other parameter values fit")]
 
 
+@pytest.mark.ci
 def test_a_parameter_without_data_is_told():
     law = lj.laws.NeoHookean(mu=770.0, bulk=None)
     (candidate,) = stress_stretch.candidates("fung_demiray")
@@ -138,6 +139,7 @@ def test_errors_hold_at_a_point_through_which_the_law_goes():
     assert np.mean([np.any(root) for root in even]) < 0.3  # equal noise is recognised
 
 
+@pytest.mark.ci
 def test_as_many_parameters_as_points_is_told():
     curve = synthetic(KNOWN["yeoh"], 0.05)[0]
     three = curve._replace(F=curve.F[[0, 13, 26]], stress=curve.stress[[0, 13, 26]])
@@ -146,6 +148,7 @@ def test_as_many_parameters_as_points_is_told():
     assert np.isnan(found.standard_errors).all() and any("as many parameters" in w for w in found.warnings)
 
 
+@pytest.mark.ci
 def test_laws_that_tie_are_named_with_their_moduli():
     (candidate,) = stress_stretch.candidates("neo_hookean")
     best = stress_stretch.fit(candidate, synthetic(KNOWN["neo_hookean"], 0.01))
@@ -157,6 +160,7 @@ def test_laws_that_tie_are_named_with_their_moduli():
     assert "to 900 Pa" in told and not stress_stretch.tied_laws([best, far], "curves")
 
 
+@pytest.mark.ci
 def test_soft_samples_have_no_larger_weight():
     """Each curve was divided by its own stress: ten samples with a mean of 1000 Pa and a scatter of 21 % gave 917."""
     moduli = np.array([700.0, 750, 800, 900, 950, 1050, 1100, 1200, 1250, 1300])

@@ -81,6 +81,7 @@ def test_several_ratios_of_the_stretches_are_no_return(tmp_path):
     assert "reverses once" in notes_of((0.5, 0.5))[0]
 
 
+@pytest.mark.ci
 def test_unloading_preload_and_decimal_commas_are_seen(tmp_path, capsys):
     up = np.linspace(1.0, 1.4, 41)
     stress = 1e3 * (up - up**-2)
@@ -138,6 +139,7 @@ def test_columns_that_hold_something_else_are_named(meaning, tmp_path, capsys):
         assert 980 < float(told[0].split("G0 ")[1].split(" Pa")[0]) < 1020
 
 
+@pytest.mark.ci
 def test_two_meanings_that_explain_the_data_alike_are_both_named(tmp_path, capsys):
     """The zero of the stretch is wrong. An offset of the stress explains the data as well, and only it was named."""
     stretch = np.linspace(1.0, 1.4, 30)

@@ -91,6 +91,7 @@ class Blatz(lj.Law):
 """
 
 
+@pytest.mark.ci
 def test_a_law_of_ones_own_is_fitted_from_its_file(tmp_path, capsys):
     file = tmp_path / "my_law.py"
     file.write_text(OWN)
@@ -116,6 +117,7 @@ continued = lj.laws.Continued(law=lj.laws.NeoHookean(mu=300.0, bulk=1e4))
 """
 
 
+@pytest.mark.ci
 def test_laws_that_add_up_are_fitted_together(tmp_path, capsys):
     file = tmp_path / "several.py"
     file.write_text(SEVERAL)
@@ -146,6 +148,7 @@ def test_coefficients_that_are_given_are_fitted_and_the_others_named(tmp_path):
     assert not stress_stretch.candidates("yeoh")[0].notes
 
 
+@pytest.mark.ci
 def test_errors_at_two_limits_are_those_of_the_law_there():
     """With c1 to infinity and c2 to 0, the exponential law is Bogen's. The product of c1 and c2 counted as known, and
     the error of alpha was five times too small."""
@@ -228,6 +231,7 @@ def test_rubber_no_worse_than_scipy_from_100_starts():
     assert ours.mean_relative_error < 0.03  # Ogden's law of 1972 with three terms fits these data
 
 
+@pytest.mark.ci
 def test_eight_chains_no_worse_than_scipy_from_100_starts():
     found, _ = curves.read_curves([DATA / "rubber_curves.csv"])
     F = [jnp.asarray(c.F) for c in found]
@@ -324,6 +328,7 @@ class Root(lj.Law):
 """
 
 
+@pytest.mark.ci
 def test_a_law_without_a_finite_stress_is_named(tmp_path, capsys):
     (tmp_path / "root.py").write_text(NOT_FINITE)
     rows = "\n".join(f"uniaxial,{l:.3f},{800 * (l - l**-2):.4f}" for l in np.linspace(0.9, 1.3, 9))

@@ -237,6 +237,7 @@ def test_a_step_that_is_taken_back_is_no_cycle():
     assert not test.cyclic and test._replace(driven=np.array([0.0, 1, 0, 1, 0, 1, 0])).cyclic
 
 
+@pytest.mark.ci
 def test_the_commands_take_a_description(tmp_path):
     layer = thin_layer.Layer(thin_layer.Indenter(shape="sphere", thickness=8e-3, poisson=0.5, radius=2e-3))
     time = np.geomspace(0.1, 100, 40)

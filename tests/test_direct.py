@@ -94,6 +94,7 @@ def test_its_gradient_against_differences():
     assert np.isclose(difference, force(770.0)[1], rtol=1e-7)
 
 
+@pytest.mark.ci
 def test_auto_decides_by_size_and_stiffness():
     static = lj.Scene(mesh=MESH, law=LAW, fixed=HELD)
     stiff = replace(static, law=replace(LAW, bulk=2000 * float(LAW.mu)))
@@ -125,6 +126,7 @@ def test_auto_decides_by_size_and_stiffness():
     lj.simulate(replace(PULLED, law=Bare(mu=770.0))).check()
 
 
+@pytest.mark.ci
 def test_the_columns_of_a_jacobian_have_one_factor(monkeypatch):
     """Each column factorised the same matrix again."""
     made, original = [], direct._factorised
@@ -184,6 +186,7 @@ def test_a_number_that_changes_costs_no_compilation():
     assert run._run._cache_size() == before
 
 
+@pytest.mark.ci
 def test_a_tangent_goes_from_step_to_step():
     """Later steps use the old tangent as long as it converges fast."""
     made = []
@@ -205,6 +208,7 @@ def test_a_tangent_goes_from_step_to_step():
     assert 1 <= len(made) < 5 < int(result.statistics.iterations.sum())
 
 
+@pytest.mark.ci
 def test_the_command_chooses_by_the_numbers_of_the_scene(tmp_path):
     scene = tmp_path / "scene.toml"
     scene.write_text(

@@ -34,6 +34,7 @@ def pulled(size: float, modulus: float, **solve) -> lj.Scene:
     )
 
 
+@pytest.mark.ci
 def test_lengths_and_moduli_are_units_only():
     reference = lj.simulate(pulled(1.0, 1.0)).check()
     for size, modulus in ((1e-6, 1e3), (1e3, 1e3), (1.0, 1e6), (1e-3, 1e9), (1.0, 1.0e-3)):
@@ -83,6 +84,7 @@ def test_ratios_that_leave_almost_nothing():
     assert np.abs(result.reactions[-1]).max() < 2e-5 * np.abs(elastic).max()
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("solver", ["cg", pytest.param("direct", marks=pytest.mark.slow)])
 def test_a_layer_ten_thousand_times_stiffer(solver):
     """The top quarter of a block is stiff. In series, only the soft part stretches."""

@@ -66,6 +66,7 @@ def laws(n: int) -> dict:
     }
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     "name",
     [n if n == "I4, one an element" else pytest.param(n, marks=pytest.mark.slow) for n in laws(8)],
@@ -158,6 +159,7 @@ def test_the_same_fibre_law_twice_is_twice_the_law():
     assert np.allclose((law + law).tangent(F), 2 * law.tangent(F), rtol=1e-12)
 
 
+@pytest.mark.ci
 def test_directions_in_a_body_of_three_elements():
     """One direction (3,) was regarded as a number of each element, and three directions (3, 3) as columns."""
     points = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1]]

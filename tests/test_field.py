@@ -172,6 +172,7 @@ def test_a_map_its_uncertainty_and_going_on(problem, tmp_path):
         field.estimate(other, length=0.02, file=file, resume=True)
 
 
+@pytest.mark.ci
 def test_a_map_goes_on_from_its_own_problem_alone(problem, tmp_path):
     def search(problem, length=0.02):
         p = prior.prior(problem.scenes[0].mesh, length)
@@ -233,6 +234,7 @@ def test_a_map_is_at_its_minimum(problem, monkeypatch):
     assert "standard deviations of the map away" in field.distance_sentence(few)
 
 
+@pytest.mark.ci
 def test_a_map_that_was_killed_ends_where_an_unbroken_one_ends(problem, monkeypatch, tmp_path):
     _of_a_formula(monkeypatch, problem, bend=0.005)
     how = {"length": 0.02, "modes": 10, "mesh_error": False}
@@ -340,6 +342,7 @@ def test_the_errors_of_mesh_and_time_step_count_as_noise(problem, monkeypatch):
             np.testing.assert_allclose(data.sd[1:], np.sqrt(factor) * before.sd[1:], rtol=1e-12)
 
 
+@pytest.mark.ci
 @pytest.mark.draws
 @pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_map_is_written_at_the_nodes_of_its_mesh(tmp_path, order):

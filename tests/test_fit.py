@@ -62,6 +62,7 @@ def test_given_deviations_change_the_weights_not_the_answer():
     assert f.uncertainty.noise == 1.0
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("draws", [12, pytest.param(24, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("given", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_noise_in_percent_does_not_make_moduli_too_small(given, draws):
@@ -132,6 +133,7 @@ def test_spreads_are_the_best_possible(draws):
     assert np.all(np.abs(np.median(errors, axis=0) / TRUTH / stated - 1) < 0.2)
 
 
+@pytest.mark.ci
 def test_intervals_cover(draws):
     values, errors, spreads = draws
     inside = np.abs(values - TRUTH) < spreads[0].quantile * errors
@@ -151,6 +153,7 @@ def test_profile_likelihood():
         assert low < TRUTH[j] < high
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("modes", [pytest.param(1, marks=pytest.mark.slow), 2, 3])
 def test_lions_mane_no_worse_than_scipy_from_50_starts(modes):
     s = read_sweep(ROOT / "data" / "lions_mane_frequency_sweep.csv")
@@ -173,6 +176,7 @@ def test_lions_mane_no_worse_than_scipy_from_50_starts(modes):
     assert f.converged and float(f.solution.cost) <= best * (1 + 1e-9)
 
 
+@pytest.mark.ci
 def test_bfgs_finds_the_same_minimum():
     s = sweep(0.02, 1)
     f = viscoelastic.closed_form(s, 2)
@@ -246,6 +250,7 @@ def test_a_number_of_modes_that_breaks_down_leaves_the_others(monkeypatch):
         viscoelastic.choose_modes(s, generalised_maxwell.spectrum(s))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("modes", [pytest.param(2, marks=pytest.mark.slow), 25])
 def test_the_picture_holds_its_table_and_its_legends_cover_nothing(modes):
     s = melt()
@@ -328,6 +333,7 @@ def test_user_is_told_what_the_data_do_not_tell():
     assert warned(small, "times the given deviations") and small.uncertainty.noise > 5
 
 
+@pytest.mark.ci
 def test_merged_modes_are_named():
     f = viscoelastic.closed_form(sweep(0.0, 0), 2)
     u = generalised_maxwell.unconstrained(Maxwell(jnp.array(770.0), jnp.array([0.3, 0.2]), jnp.array([0.12, 0.1])))

@@ -58,6 +58,7 @@ def spoiled(data: bytes, rng: np.random.Generator) -> bytes:
     return bytes(out)
 
 
+@pytest.mark.ci
 def test_two_hundred_spoiled_files_are_read_or_get_one_sentence(tmp_path):
     rng = np.random.default_rng(7)
     small = [(f, kind) for f, kind in FILES if (FOLDER / f).stat().st_size < 50_000]

@@ -48,6 +48,7 @@ def velocity(scene: lj.Scene, result) -> float:
     return float(m @ last / m.sum() / DT)
 
 
+@pytest.mark.ci
 def test_a_block_sticks_below_the_angle_of_friction_and_slides_above():
     """The speed is g (sin - mu cos) t, and the shear force is mu times the normal force of the plane."""
     seen = {}

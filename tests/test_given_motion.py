@@ -49,6 +49,7 @@ def _order(scene: lj.Scene, moved: np.ndarray) -> list[float]:
     return [float(np.log2(a / b)) for a, b in zip(*size, strict=True)]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("mass", ["lumped", pytest.param("consistent", marks=pytest.mark.slow)])
 def test_displaced_nodes_have_reactions_of_second_order(mass):
     """The inertia force of displaced nodes was that of one step before: the reactions were of first order and, with a

@@ -175,6 +175,7 @@ def stretched(scene: lj.Scene, stretch: float) -> jax.Array:
     return scene.mesh.points * jnp.array([[1.0, 1.0, stretch]])
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("part", [pytest.param("all", marks=pytest.mark.slow), "isochoric"])
 def test_about_a_stretched_state(part):
     """The stress that has not relaxed stiffens the slab. Its modulus in this state is computed from the energy
@@ -261,6 +262,7 @@ def test_the_error_of_the_mesh(order, n):
         lj.harmonic_mesh_error(slab(2, 1), found)
 
 
+@pytest.mark.ci
 def test_derivatives_in_both_modes_and_by_differences():
     """Derivatives with respect to element moduli, the relaxation time and the density. The error of differences has its
     minimum at eps^(2/3).

@@ -152,6 +152,7 @@ def test_nodal_volumes_become_what_quadratic_elements_allow(below, form):
             check_volumetric(replace(scene, solve=lj.Solve(volumetric="mixed")))
 
 
+@pytest.mark.ci
 def test_a_body_whose_density_varies_keeps_it_in_the_richer_space():
     """Added shape functions once had the mean density of the body, and a stated error was four times the true one."""
     mesh = lj.quadratic(lj.shapes.box((0.1, 0.03, 0.03), (4, 1, 1)))

@@ -44,6 +44,7 @@ def off_terzaghi(scene: lj.Scene) -> list[float]:
     return [float(np.abs(a - b).max() / np.abs(b).max()) for a, b in pairs]
 
 
+@pytest.mark.ci
 def test_terzaghis_column_under_an_oscillating_load(verified):
     """The error is of first order in the thickness of the layer at the drained top, as in transient runs."""
     errors = np.array([off_terzaghi(column(n, 1, 1.0)) for n in (12, 24)])
@@ -134,6 +135,7 @@ def sphere_box(n: int, bulk: float, volumetric: str) -> float:
     return float(np.abs(found.displacement[0] - exact).max() / np.abs(exact).max())
 
 
+@pytest.mark.ci
 def test_waves_that_keep_the_volume(verified):
     """Around an oscillating sphere with K = 100,000 G, mixed elements have their order. Others have large errors."""
     errors = [sphere_box(n, 1e5, "mixed") for n in (3, 6)]
@@ -143,6 +145,7 @@ def test_waves_that_keep_the_volume(verified):
     verified("swinging sphere, K = 100,000 G, mixed quadratic elements", "closed form", errors[1], 3e-3, order)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("volumetric", "order"), [*(pytest.param("mixed", k, marks=pytest.mark.slow) for k in (1, 2)), ("nodal", 1)]
 )
@@ -164,6 +167,7 @@ def test_about_a_stretched_state_with_pressures(volumetric, order):
     assert np.abs(found - exact).max() < 2e-3 * np.abs(exact).max()
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("other", [{"bulk": 40000.0}, lj.laws.Yeoh(c1=200.0, c2=10.0, c3=1.0, bulk=8000.0)])
 def test_slow_waves_with_nodal_volumes_know_the_regions(other):
     """Moduli of elements were used as moduli of nodes: a traceback, or 6 % of error if there are as many elements as
@@ -257,6 +261,7 @@ def test_derivatives_of_mixed_elements_about_a_state():
     check_derivatives(scene, at | {"body.density": jnp.asarray(1e3)}, FREQUENCIES, about)
 
 
+@pytest.mark.ci
 def test_the_mesh_s_error_of_a_sponge_takes_factors_of_elements():
     """The refined mesh has eight times as many elements, and the factors of the scene were refused for it."""
     scene = replace(column(1, 1, 1.0), body=lj.Body(density=1000.0))

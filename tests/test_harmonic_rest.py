@@ -125,6 +125,7 @@ def test_a_region_that_relaxes_slowly_counts_in_a_loaded_shape():
         assert bool(said) == told and (not told or "relaxation time is 20 s" in said[0])
 
 
+@pytest.mark.ci
 def test_a_run_whose_tractions_act_at_held_nodes_has_rested(tmp_path):
     """The body is elastic. Where a traction acts at a held node, the reaction was taken for unrelaxed stress."""
     (tmp_path / "push.toml").write_text("""mesh = {shape = "box", size = [0.02, 0.02, 0.02], cells = [2, 2, 2]}

@@ -18,6 +18,7 @@ from liverjax.waves.harmonic import largest_in_period
 pytestmark = pytest.mark.quick_to_compile
 
 
+@pytest.mark.ci
 def test_scene_files(tmp_path, capsys):
     scene = tmp_path / "scene.toml"
     scene.write_text(FILE + "frequencies = [40.0, 60.0]\n")

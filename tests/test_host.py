@@ -15,6 +15,7 @@ from fitting.methods.least_squares import from_starts, levenberg_marquardt, with
 from fitting.readers.rheometer import read_sweep
 
 
+@pytest.mark.ci
 def test_numpy_and_jax_run_the_same_formula_and_its_derivative():
     """Derivatives by complex steps agree with forward mode. Leading axes are separate fits."""
     rng = np.random.default_rng(0)

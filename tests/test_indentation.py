@@ -251,6 +251,7 @@ def test_an_offset_of_the_sensor_is_taken_off_and_decimals_follow_the_table(tmp_
     assert np.allclose(read_indentation(tmp_path / "c.csv").force, force[40:], rtol=1e-7)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("offset", [0.05, *(pytest.param(v, marks=pytest.mark.slow) for v in (0.3, 0.0, -0.05))])
 def test_the_zero_of_the_force_is_fitted_with_its_error(offset):
     """An offset of 5 % of the largest force changed the modulus by 11 %, and by 3 to 17 standard errors with 5 % of
@@ -268,6 +269,7 @@ def test_the_zero_of_the_force_is_fitted_with_its_error(offset):
     assert np.all(np.mean(hits, axis=0) >= 0.88), np.mean(hits, axis=0)  # 95 % of 40: 35 or more in 97 % of cases
 
 
+@pytest.mark.ci
 def test_a_large_offset_is_fitted_whatever_the_noise_before_contact():
     """By chance, the noise before contact rises by more than two standard errors in one of twenty curves. The offset
     then became a contact force, and the modulus was half of the true one."""
@@ -319,6 +321,7 @@ def test_the_modulus_of_a_half_space_is_that_of_a_fit(tmp_path):
     assert content["half_space_young_modulus"] == pytest.approx(alone.modulus, rel=1e-4) and alone.modulus > 1500
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_reading_of_one_step_below_zero_is_no_adhesion(tmp_path, seed):
     """The estimate of the noise is 0 if most forces are rounded to the same value."""

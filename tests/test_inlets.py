@@ -51,6 +51,7 @@ def pressures(scene: lj.Scene, steps: int = 1) -> np.ndarray:
     return np.asarray(memory.pressure)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_fluid_is_driven_through(order):
     """Steady flow: linear from one given pressure to the other. With a given flux v, the gradient is v/kappa."""
@@ -61,6 +62,7 @@ def test_fluid_is_driven_through(order):
     assert np.allclose(pressures(driven), 100.0 + 500.0 * (0.1 - x), rtol=1e-6)
 
 
+@pytest.mark.ci
 def test_forces_and_fluid_together_lack_nothing_and_are_symmetric():
     """The derivatives of a step contain forces and fluid, with given pressures among the unknowns."""
     soft = {"bulk": 400.0, "limit_bulk": 2200.0, "permeability": 2e-5}

@@ -97,6 +97,7 @@ def test_strains_may_have_any_order():
     assert 0.1 < limit < 0.3 and torsion.linearity_limit(strains[::-1], storage[::-1]) == limit
 
 
+@pytest.mark.ci
 def test_the_time_steps_of_a_torsion_test_are_in_its_errors():
     test = joint.torsion_sweep(SWEEP, RIG, 1e-7, torsion.Drive(steps=20))
     prony = Prony(ratios=MODEL.ratios, relaxation_times=MODEL.relaxation_times)

@@ -114,6 +114,7 @@ def test_right_scenes_pass():
     check_before_run(scene(traction=(lj.Traction(triangles=FACES[:, ::-1], value=(0.0, 0.0, 50.0)),)))
 
 
+@pytest.mark.ci
 def test_masks_and_lists_are_taken_as_their_numbers():
     mask, half = POINTS[:, 2] < 1e-9, np.arange(E) < 5
     mesh = lj.tet_mesh(POINTS, MESH.tetrahedra, {"bottom": mask}, {"half": half})

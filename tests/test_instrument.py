@@ -55,6 +55,7 @@ def sweep_with_hidden_mode() -> Sweep:
     return Sweep(omega, G.real, G.imag, inertia=share)
 
 
+@pytest.mark.ci
 def test_the_number_of_modes_is_chosen_again_with_the_error_of_the_inertia():
     """An inertia that is 2 % too small made G' fall with the frequency. Two modes did not converge, one mode was kept,
     and G0 was 802 ± 15 Pa. The warning about this was lost.
@@ -74,6 +75,7 @@ def test_the_number_of_modes_is_chosen_again_with_the_error_of_the_inertia():
     assert np.allclose(squeezed.uncertainty.values, same.uncertainty.values, rtol=1e-6)
 
 
+@pytest.mark.ci
 def test_an_impossible_correction_of_the_inertia_is_no_error():
     """More modes are tried from an inertia that is wrong by 3 %. This made the moduli of a good sweep impossible."""
     omega = 2 * np.pi * np.logspace(-2, 1, 12)
@@ -85,6 +87,7 @@ def test_an_impossible_correction_of_the_inertia_is_no_error():
     assert abs(fit.model.shear_modulus - 1000) < 5
 
 
+@pytest.mark.ci
 def test_the_error_of_the_inertia_is_found_and_its_standard_error_is_right():
     off = 5e-4
     found = [corrected(sweep(off, seed))[0].details["instrument"] for seed in range(16)]
@@ -94,6 +97,7 @@ def test_the_error_of_the_inertia_is_found_and_its_standard_error_is_right():
     assert np.mean(steady) > 0.8  # two standard errors: 5 % by chance
 
 
+@pytest.mark.ci
 def test_what_is_corrected_comes_nearer_and_has_an_honest_error():
     values = np.array([800, 0.3, 0.3, 2.0, 0.05])
     plain, mended, z = [], [], []
@@ -259,6 +263,7 @@ def test_errors_of_the_instrument_that_are_not_found_are_not_called_zero(monkeyp
     assert known.steady.all() and not known._replace(found=False).steady.any()
 
 
+@pytest.mark.ci
 def test_the_command_fits_friction_and_refuses_it_without_a_size(tmp_path, capsys):
     s = sweep(0.0, 3)
     head = "angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa"

@@ -86,6 +86,7 @@ def test_force_and_stiffness_are_derivatives_of_the_energy(order, kinds):
     np.testing.assert_allclose(jax.jit(reference.energy)(mesh, law, x), exact, rtol=1e-13)
 
 
+@pytest.mark.ci
 def test_projected_stiffness_has_no_negative_eigenvalue():
     mesh = block(1, (2, 2, 2))
     E = mesh.number_of_elements
@@ -353,6 +354,7 @@ def test_numbers_out_of_bounds_have_their_place():
         lj.check_scene(pulled("static", lambda e: lj.Region(elements=e, law=dataclasses.replace(LIVER, bulk=-1.0))))
 
 
+@pytest.mark.ci
 def test_terms_of_a_law_are_not_values_of_elements():
     """In a body of two elements, each element had one of the two terms of a law with arrays."""
     points = 0.1 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])

@@ -117,6 +117,7 @@ def _stop_after(monkeypatch, count: int) -> None:
     monkeypatch.setattr(resumable_parts, "write", until)
 
 
+@pytest.mark.ci
 def test_a_stopped_run_goes_on_to_the_same_numbers(scene, tmp_path, monkeypatch, capsys):
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     command = ["simulate", str(scene), "--every", "4", "--out"]

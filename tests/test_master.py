@@ -56,6 +56,7 @@ def test_sweeps_with_a_gap_between_them_are_refused():
         shifts.found(parts, 273.15 + np.array([0.0, 60.0]), 0)
 
 
+@pytest.mark.ci
 def test_standard_errors_of_factors_are_right():
     z, of_law = [], []
     for seed in range(24):
@@ -71,6 +72,7 @@ def test_standard_errors_of_factors_are_right():
     assert 0.6 < np.sqrt(np.mean(np.square(of_law))) < 1.4
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("noise", [(0.004, 0.08), (0.08, 0.004)])
 def test_standard_errors_of_factors_are_right_if_the_noise_of_the_moduli_differs(noise):
     """Both moduli had the same weight. The standard errors were up to two times too small, or five times too large."""
@@ -83,6 +85,7 @@ def test_standard_errors_of_factors_are_right_if_the_noise_of_the_moduli_differs
     assert np.median(of_the_better) < 0.02  # decades; 0.05 with equal weights
 
 
+@pytest.mark.ci
 def test_errors_of_factors_contain_the_noise_where_points_scatter():
     """A curve with knots 0.4 decades apart follows the noise. Then the errors were only a half to a fifth of the right
     size.
@@ -118,6 +121,7 @@ def test_factors_of_the_moduli_are_told_where_only_frequencies_are_shifted(verti
     assert not any("factors too" in n for n in master_curve.master_curve(data, None, vertical=True).sweep.notes)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("noise", [pytest.param(0.02, marks=pytest.mark.slow), 0.05])
 def test_no_factors_are_told_of_a_power_law(noise):
     """For a power law, any shift a can be replaced by a factor b. The note changed log a by more than a decade in 8 to
@@ -333,6 +337,7 @@ def test_what_cannot_be_shifted_gets_one_sentence(tmp_path, capsys, text, option
     assert sentence in error and "Traceback" not in error and error.count("\n") == 1
 
 
+@pytest.mark.ci
 def test_twenty_measured_tables_make_one_curve():
     file = SHARED / "data" / "rheology" / "rheojax" / "frequency_sweep_tts.txt"
     if not file.exists():

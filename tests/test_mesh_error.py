@@ -189,6 +189,7 @@ def test_forces_at_single_nodes_are_named_beside_the_mesh_error():
     assert "single nodes" not in mesh_sentence(scene, result)
 
 
+@pytest.mark.ci
 def test_the_command_refuses_before_the_run_and_never_loses_the_result(tmp_path, monkeypatch, capsys):
     """The mesh error was refused after the last step, and nothing was written."""
     text = """mesh = {shape = "box", size = [0.02, 0.02, 0.02], cells = [1, 1, 1]}

@@ -69,6 +69,7 @@ def test_a_cube_between_planes_and_an_elastic_foundation(history):
     assert _relative_error(_cube(physics=(springs,), traction=(push,), solve=lj.Solve(dt=dt))) < ROUNDOFF
 
 
+@pytest.mark.ci
 def test_a_foundation_of_order_3_has_the_derivatives_of_its_energy():
     scene = enriched(_cube(physics=(ElasticSupport(triangles=_face("z_max"), normal=3e3, tangential=5e2),)))
     rich, rng = scene.mesh, np.random.default_rng(0)
@@ -90,6 +91,7 @@ def _motions(scene: lj.Scene) -> tuple[np.ndarray, jax.Array]:
     return free_places(mesh, scene.fixed, displaced), prescribed(mesh, displaced, 0.5, 1.0)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("richer", [enriched, lambda scene: on_refined_mesh(scene)[0]])
 def test_a_clamp_of_two_entries_is_a_clamp_of_one(order, richer):
@@ -162,6 +164,7 @@ def test_one_density_per_node_keeps_float32():
     assert rich.body.density.dtype == jnp.float32 and rich.body.density.shape == (rich.mesh.number_of_nodes,)
 
 
+@pytest.mark.ci
 def test_stiffness_of_order_3_is_the_derivative_of_the_force():
     """The signs of the functions on edges were missing."""
     rich = cubic(lj.quadratic(lj.shapes.box((0.1, 0.1, 0.1), (1, 1, 1))))
@@ -174,6 +177,7 @@ def test_stiffness_of_order_3_is_the_derivative_of_the_force():
         assert np.abs(other - force).max() < 1e-12 * np.abs(force).max()
 
 
+@pytest.mark.ci
 def test_pressure_on_a_closed_surface_of_order_3_is_the_change_of_volume():
     """In a sheared shape, the force and its change with a motion are compared with derivatives of the elements'
     volume.

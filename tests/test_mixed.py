@@ -48,6 +48,7 @@ def _cook(order: int, n: int, ratio: float, kind: str = "quadratic", **solve) ->
     )
 
 
+@pytest.mark.ci
 def test_g_of_every_volumetric_energy_is_its_root():
     J = jnp.array([0.3, 0.85, 0.9, 0.95, 1.0, 1.0 + 1e-9, 1.05, 1.1, 1.2, 3.0])
     for kind in ("quadratic", "log", "simo"):
@@ -60,6 +61,7 @@ def test_g_of_every_volumetric_energy_is_its_root():
         assert np.isclose(slope[4], 1.0, atol=1e-15) and np.all(slope > 0)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_the_mixed_tangent_is_symmetric_and_the_derivative(order):
     scene = _cook(order, 2, 1e3, kind="simo", volumetric="mixed")
@@ -77,6 +79,7 @@ def test_the_mixed_tangent_is_symmetric_and_the_derivative(order):
     assert abs(float(w @ Kv - v @ Kw)) < 1e-13 * float(jnp.abs(w) @ jnp.abs(Kv))
 
 
+@pytest.mark.ci
 def test_mixed_elements_do_not_lock_and_iterations_do_not_grow():
     """As K/mu grows, the result converges, and the number of iterations stays bounded."""
     scene = _cook(2, 4, 1e2, volumetric="mixed")
@@ -103,6 +106,7 @@ def _ended(scene: lj.Scene, ratio: float = 1e4) -> tuple[lj.Result, np.ndarray]:
     return result.check(), np.asarray(state.memories[1])
 
 
+@pytest.mark.ci
 def test_linear_elements_with_pressures_do_not_lock_and_pressures_stay_smooth():
     """Compared with quadratic elements, the error is 4 % at every K/mu. So it is a mesh error and not locking."""
     scene, fine = _cook(1, 8, 10.0, volumetric="mixed"), _cook(2, 4, 1e4, volumetric="mixed")
@@ -117,6 +121,7 @@ def test_linear_elements_with_pressures_do_not_lock_and_pressures_stay_smooth():
     assert most[3] < 1.1 * most[1]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", ["quadratic", pytest.param("log", marks=pytest.mark.slow)])
 def test_mixed_elements_pass_the_patch_test(order, kind):
@@ -245,6 +250,7 @@ _CONFINED = pytest.mark.parametrize(
 )
 
 
+@pytest.mark.ci
 @_CONFINED
 def test_pressures_of_a_confined_body_are_exact_to_the_tolerance(order, ratio, tolerance):
     """Small volume changes alone determine the pressures. With a volume equation weighted by mu, they had an error of 2
@@ -264,6 +270,7 @@ def test_pressures_of_a_confined_body_are_exact_to_the_tolerance(order, ratio, t
         lj.simulate(replace(scene, solve=replace(scene.solve, precision="float32"))).check()
 
 
+@pytest.mark.ci
 @_CONFINED
 def test_a_loaded_lid_of_a_confined_body_moves_as_far_as_its_bulk_allows(order, ratio, tolerance):
     """The forces of the pressures are K/mu times larger than all others. The motion of the lid had an error of 0.03 to
@@ -282,6 +289,7 @@ def test_a_loaded_lid_of_a_confined_body_moves_as_far_as_its_bulk_allows(order, 
     assert np.isclose(moved, exact, rtol=tolerance, atol=0)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("dt", [1e-4, 1e-5])
 def test_short_time_steps_reach_the_tolerance(dt):
     """Inertia counts mu/K times. Its roundoff in a short step was above the tolerance, and each step stalled."""
@@ -296,6 +304,7 @@ def test_short_time_steps_reach_the_tolerance(dt):
     assert int(np.max(lj.simulate(scene).check().statistics.iterations)) <= 3
 
 
+@pytest.mark.ci
 def test_single_precision_reports_that_a_small_load_is_lost_in_roundoff():
     """If roundoff of single precision counted as a solution, this run had status 0 with a residual of 13 %."""
     mesh = lj.shapes.box((0.04, 0.04, 0.04), (2, 2, 2))

@@ -24,6 +24,7 @@ KINDS = ("neo_hookean", "mooney_rivlin", "saint_venant_kirchhoff")
 OTHERS = [n for n in LAWS if n not in (*KINDS, "ogden", "logarithmic", "exponential")]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("name", [*KINDS, *(pytest.param(n, marks=pytest.mark.slow) for n in OTHERS)])
 def test_force_and_stiffness_against_both_references(name, distorted_box):
     mesh, x = distorted_box

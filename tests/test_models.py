@@ -454,6 +454,7 @@ def test_limits_of_prony_modes_have_the_error_of_their_band(name, limits):
     assert sweep_report.summary(prony, s)["standard_errors"]["shear_modulus"] == prony.uncertainty.standard_errors[0]
 
 
+@pytest.mark.ci
 def test_an_exponent_at_its_bound_is_told():
     s = Sweep(OMEGA, 1e-3 * OMEGA, 10.0 * OMEGA)
     (fit,) = (f for f in models.fractional(s) if f.kind.name == "springpot")

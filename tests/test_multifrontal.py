@@ -120,6 +120,7 @@ def scene(cells: tuple[int, int, int] = (3, 2, 2)) -> lj.Scene:
     )
 
 
+@pytest.mark.ci
 def test_derivatives_take_the_factors_of_the_values(monkeypatch):
     made = []
 
@@ -252,6 +253,7 @@ print([float(solve(jnp.ones(3_000_000) + k)) for k in range(40)][-1])
 """
 
 
+@pytest.mark.ci
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="no cores to choose")
 def test_a_solve_on_the_host_does_not_wait_for_itself_on_one_core():
     """On one core JAX has one thread. It runs the solve, and would have to copy the data that the solve waits for."""

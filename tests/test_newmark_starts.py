@@ -97,6 +97,7 @@ def test_derivatives_by_a_stretched_start():
     assert np.isclose(jax.grad(end)(jnp.asarray(0.02)), difference, rtol=1e-5)
 
 
+@pytest.mark.ci
 def test_the_first_acceleration_has_all_forces_at_the_start():
     """Mass times acceleration is minus the law's force, plus the fluid pressure of a porous body, P0 on a third of the
     area.

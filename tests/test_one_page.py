@@ -15,6 +15,7 @@ from liverjax.core.versions import versions
 pytestmark = pytest.mark.quick_to_compile
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("more", [0, 60])
 def test_the_page_holds_it_all(more):
     sweep = rheometer.read_sweep(ROOT / "data" / "lions_mane_frequency_sweep.csv")
@@ -44,6 +45,7 @@ def test_no_line_is_wider_than_the_page():
     assert "if the volume is kept" in re.sub(r"\s+", " ", " ".join(lines))
 
 
+@pytest.mark.ci
 @pytest.mark.draws
 def test_the_command_writes_it(tmp_path, capsys):
     data = str(ROOT / "data" / "lions_mane_frequency_sweep.csv")

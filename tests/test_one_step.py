@@ -31,6 +31,7 @@ def hanging(**solve) -> lj.Scene:
     )
 
 
+@pytest.mark.ci
 def test_one_step_of_newton_is_the_chapters_scheme():
     scene = hanging(kind="dynamic", dt=0.01, steps=5, newton="one_step")
     one, full = lj.simulate(scene), lj.simulate(replace(scene, solve=replace(scene.solve, newton="converged"))).check()
@@ -53,6 +54,7 @@ def test_one_step_of_newton_says_when_its_residual_is_above_the_tolerance():
     assert int(loose.status[0]) == status.CONVERGED
 
 
+@pytest.mark.ci
 def test_one_step_of_newton_solves_to_the_tolerance_asked_for():
     """With a millionth of the weight the body is linear, so only the error of the linear solve remains."""
     scene = hanging(steps=1, newton="one_step", tolerance=1e-9)
@@ -90,6 +92,7 @@ def test_a_sweep_reports_a_failure_rather_than_one_step():
     assert _failures(rows, codes) == {3: status.NOT_FINITE, 5: status.ONE_STEP}
 
 
+@pytest.mark.ci
 def test_a_dynamic_step_of_one_solve_has_the_loads_and_motions_at_its_end():
     """They acted one step late. The motions are small, so one solve is exact."""
     scene, times = hanging(kind="dynamic", dt=0.01, steps=2, newton="one_step"), jnp.array([0.0, 0.02])

@@ -92,6 +92,7 @@ def files_of_plain(order: int) -> frozenset[str]:
     return frozenset(files(traced(scene_of(order, {})).jaxpr))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_only_scenes_that_have_it_hold_its_equations(order):
     scene = scene_of(order, {})

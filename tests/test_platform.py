@@ -80,6 +80,7 @@ def test_the_import_sets_64_bits_and_no_cache():
     assert run.stdout.strip() == "True None", run.stderr
 
 
+@pytest.mark.ci
 def test_types_are_checked():
     run = subprocess.run([sys.executable, "-m", "mypy"], cwd=ROOT, capture_output=True, text=True)
     assert run.returncode == 0, run.stdout
@@ -105,6 +106,7 @@ def _two_numbers(k):
     return Law
 
 
+@pytest.mark.ci
 def test_one_law_never_runs_the_program_of_another():
     # With `register_dataclass`, jax 0.10.0 and 0.10.1 give 35 to 61 wrong results of 300 here.
     value = jax.jit(lambda thing: thing.value())

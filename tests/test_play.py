@@ -95,6 +95,7 @@ def test_a_step_that_fails_leaves_the_body_as_it_was(still):
     assert pulling.pulled(far).code == status.CONVERGED
 
 
+@pytest.mark.ci
 def test_loads_act_before_anyone_pulls(still, monkeypatch):
     rest = np.asarray(still.scene.mesh.points)
     np.testing.assert_allclose(still.positions[RAISED] - rest[RAISED], [0, 0, 0.004], atol=1e-12)
@@ -146,6 +147,7 @@ def served(moving):
         thread.join()
 
 
+@pytest.mark.ci
 def test_the_page_gets_a_surface_and_a_step_for_every_picture(served, moving):
     page = served("GET", "/")[1].decode()
     # nothing is loaded from other servers
@@ -199,6 +201,7 @@ dt = 0.01
 """
 
 
+@pytest.mark.ci
 def test_the_command_pulls_without_a_page_and_refuses_in_a_sentence(tmp_path, capsys):
     scene = tmp_path / "cube.toml"
     scene.write_text(SCENE)

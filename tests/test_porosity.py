@@ -206,6 +206,7 @@ def test_two_porous_platens_are_a_list_of_places():
     assert drained(both[:1]) == drained(both[0]) == drained({"set": "z_min"}) == ends[0]
 
 
+@pytest.mark.ci
 def test_only_a_porous_scene_has_pressure():
     scene = column(1, 1, 1.0)
     assert any(isinstance(m, porosity.Fluid) for m in initial_state(scene).memories)
@@ -232,6 +233,7 @@ def test_unusable_porosity_is_refused(change, sentence):
         column(1, 1, 1.0, **change)
 
 
+@pytest.mark.ci
 def test_confined_compression_of_febio(febio, verified):
     # FEBio's biphasic material stores no fluid: the chapter's equation with K_lim far above every other stiffness.
     nodes = np.loadtxt(febio / "column_nodes.csv", delimiter=",")
@@ -368,6 +370,7 @@ def test_the_drained_layer_contains_the_bulk_modulus_that_the_law_keeps(kind):
         assert of_drained_layer(apart, 1.01 * seconds, "in {:.3g} s")
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("part", "told"), [(0.3, True), (2.0, False)])
 def test_a_pressure_that_overshoots_beside_the_drained_face_is_told(part, told):
     """The load causes P = 1 at most. Steps of at least h^2/(4 kappa M) do not exceed this; shorter steps do by

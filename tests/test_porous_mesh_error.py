@@ -55,6 +55,7 @@ def swinging(z, omega):
     return (pressure * (z - np.sinh(wave * z) / (wave * np.cosh(wave * HEIGHT))) - LOAD * z) / M, P
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("order", "omega"),
     [
@@ -144,6 +145,7 @@ def test_fields_keep_their_function_on_the_refined_mesh(order):
     assert np.isclose(work, np.sum(f * Y**power), rtol=1e-13)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("order", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_a_scene_on_the_refined_mesh_has_its_regions_places_and_loads(order):
     mesh = lj.shapes.box((0.02, 0.01, 0.01), (2, 1, 1))

@@ -77,6 +77,7 @@ def test_flow_through_two_layers(order, verified):
     np.testing.assert_allclose(pressure, exact, atol=1e-8)
 
 
+@pytest.mark.ci
 def test_the_fluid_s_velocity_is_that_of_each_layer():
     from liverjax.jobs.fields import fields
 

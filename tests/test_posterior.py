@@ -339,6 +339,7 @@ def test_chains_that_do_not_agree_are_named():
     assert "R-hat 1.3" in found._replace(r_hat=np.array([1.0, 1.3, 1.0, 1.0])).warnings()[0]
 
 
+@pytest.mark.ci
 def test_a_posterior_that_the_prior_cuts_is_told():
     """The mode has 8 s. Frequencies from 0.3 Hz on do not distinguish it from longer ones, and the prior ends
     at 5 s.

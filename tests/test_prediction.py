@@ -59,6 +59,7 @@ def test_errors_of_a_sweep_with_deviations_are_relative_to_its_moduli():
     assert "within 9.1 % on average" in prediction.sentence(found)
 
 
+@pytest.mark.ci
 def test_a_stiffer_sample_is_a_factor_and_waves_are_predicted_too():
     s = sweep(0.0, 0)
     fit = viscoelastic.closed_form(s, 2)

@@ -73,6 +73,7 @@ def _entries(cache: Path) -> list[Path]:
     return sorted(cache.glob("*/*-cache"))
 
 
+@pytest.mark.ci
 def test_a_second_process_finds_the_programs_and_the_same_bits(tmp_path):
     """Two processes compile at once, one reads, and one finds every entry spoiled. None writes to standard error."""
     cache = tmp_path / "kept"
@@ -258,6 +259,7 @@ with kept_on_disk():
 """
 
 
+@pytest.mark.ci
 def test_a_program_that_factorises_runs_from_disk(processor, tmp_path):
     first, second = (_ended(_started(["-c", FACTORISES], tmp_path)) for _ in range(2))
     assert first == second and _whole(tmp_path)

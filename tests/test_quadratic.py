@@ -69,6 +69,7 @@ def test_terms_at_points_are_derivatives_of_the_energy(name):
     assert K.shape == (3 * MESH.number_of_nodes,) * 2 and abs(K - H).max() < 2e-11 * abs(H).max()
 
 
+@pytest.mark.ci
 def test_terms_of_stretches_at_points_are_differences_of_the_energy():
     """A fast variant of the test before, for a law of principal stretches, whose second derivatives compile slowly."""
     law = lj.laws.typical("ogden")
@@ -191,6 +192,7 @@ def _harmonic(p):
     return 1e-7 * jnp.stack([first, second, a * (x**2 - y**2)])
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("order", "cells"), [pytest.param(1, (4, 8), marks=pytest.mark.slow), (2, (2, 4))])
 def test_observed_orders_of_a_smooth_solution(order, cells, verified):
     (u1, F1), (u2, F2) = (_errors(order, n) for n in cells)

@@ -91,6 +91,7 @@ def test_what_the_claim_on_porosity_takes_is_told_from_both_sides():
     ]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("block", blocks("python"))
 def test_examples_run_as_printed(block, monkeypatch, capsys):
     """Each example runs with its own imports only, as for users. It runs in this process, because a new one imports JAX
@@ -163,6 +164,7 @@ def test_command_lines_are_parsed(block, monkeypatch):
                 assert "/" not in word or (ROOT / word.split(":")[0]).is_file(), word
 
 
+@pytest.mark.ci
 def test_the_law_of_the_guide_passes_the_check_as_printed(tmp_path, capsys):
     text = GUIDES["liverjax/README.md"].read_text()
     (law,) = (block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "lj.Law" in block)

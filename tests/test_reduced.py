@@ -61,6 +61,7 @@ def test_a_reduced_run_that_failed_has_no_small_error(factor):
     assert estimate._softening(scene, r, factor * scene.mesh.points) == np.inf
 
 
+@pytest.mark.ci
 def test_failed_training_runs_are_told():
     scene = _bar((3, 1, 1), solve=lj.Solve(newton_iterations=8))
     with pytest.warns(UserWarning, match=r"1 of 3 training runs failed .*body.gravity.2 = -300"):
@@ -133,6 +134,7 @@ def test_states_of_all_times_are_sampled(runs):
     assert np.all(thirds > 0.25)  # a third each, apart from a few at the ends
 
 
+@pytest.mark.ci
 def test_the_reduced_force_is_the_gradient_of_the_reduced_energy(trained):
     scene, model, *_ = trained
     assert np.all(np.asarray(model.weights) > 0) and len(model.points) < scene.mesh.weights.size
@@ -204,6 +206,7 @@ def test_solves_are_exact_though_the_inverse_is_near(small):
     assert np.allclose(change, -exact, rtol=0, atol=limit)
 
 
+@pytest.mark.ci
 def test_a_state_that_is_inside_out_or_at_rest_has_no_say_in_the_points(trained):
     scene, model, *_ = trained
     whole, mu = with_all_points(scene, model.modes), 800.0
@@ -217,6 +220,7 @@ def test_a_state_that_is_inside_out_or_at_rest_has_no_say_in_the_points(trained)
     assert np.array_equal(alone.points, beside.points) and np.allclose(alone.weights, beside.weights, rtol=1e-9)
 
 
+@pytest.mark.ci
 def test_points_of_a_body_that_is_only_moved():
     """Without a load the forces cancel, so states were divided by roundoff or were regarded as at rest."""
     scene = replace(_bar((2, 1, 1)), body=None)
@@ -306,6 +310,7 @@ def test_stated_errors_are_right_as_often_as_those_of_runs_left_out():
     assert abs(seen - told) < 3 * np.sqrt(spread) + 1 / 80
 
 
+@pytest.mark.ci
 def test_a_body_at_rest_converges_and_has_no_error_to_state(trained):
     scene, model, *_ = trained
     still = lj.with_parameters(scene, {"body.gravity": jnp.zeros(3)})
@@ -322,6 +327,7 @@ def test_a_body_at_rest_converges_and_has_no_error_to_state(trained):
     assert stated(0.0) == 0 and jax.grad(stated)(0.0) == 0
 
 
+@pytest.mark.ci
 def test_a_model_of_the_first_rows_is_kept_if_all_later_runs_fail(monkeypatch):
     """The four runs that converged were lost, with the message that none of the 2 runs converged."""
     monkeypatch.setattr(training, "_model_of", lambda scene, runs, *settings: runs)
@@ -444,6 +450,7 @@ def _heavier(scene, density):
     return lj.with_parameters(scene, {"body.density": density})
 
 
+@pytest.mark.ci
 def test_without_the_correction_its_size_is_the_stated_error(trained):
     """If the correction is right, it is the error of the motion without correction."""
     scene, model, *_ = trained

@@ -36,6 +36,7 @@ where = {x_max = 0.0}
 """
 
 
+@pytest.mark.ci
 def test_the_commands_make_and_use_a_model_and_turn_to_the_full_one(tmp_path, capsys):
     (tmp_path / "scene.toml").write_text(SCENE)
     (tmp_path / "rows.csv").write_text("law.mu,body.gravity.2\n700,-1.2\n900,-0.8\n800,-0.4\n800,-1.0\n")

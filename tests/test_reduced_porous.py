@@ -92,6 +92,7 @@ def test_all_motions_pressures_and_points_are_the_full_model(order, scheme, solv
     _assert_same(scene, full.positions, full.pressure)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("order", [1, 2])
 def test_storage_at_vertices_is_that_of_the_points(order):
     """The sampled points belong to several elements that share vertices, with uneven volumes."""
@@ -111,6 +112,7 @@ def test_storage_at_vertices_is_that_of_the_points(order):
     assert reduced_sponge(one, scene).lumped is None  # fewer points than vertices
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("scheme", ["implicit", "lagged"])
 def test_the_tangent_is_the_derivative_of_the_forces(scheme):
     scene = _sponge((1, 1, 1), scheme=scheme)
@@ -214,6 +216,7 @@ def test_derivatives_by_numbers_of_the_fluid(trained):
     assert jax.jit(jax.hessian(tip))(2.0) == pytest.approx(float(second), rel=1e-4)
 
 
+@pytest.mark.ci
 def test_files_keep_the_pressure_and_other_fluids_are_refused(trained, tmp_path):
     scene, model, *_ = trained
     lj.save_reduced(model, tmp_path / "model.h5")

@@ -62,6 +62,7 @@ def test_all_motions_and_points_on_springs_are_the_full_model(order, changes):
     assert np.abs(far - near).max() > 0.05 * moved
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("order", [1, 2])
 def test_the_matrix_of_springs_is_the_derivative_of_their_forces(order):
     scene = _on_springs(order)

@@ -218,6 +218,7 @@ def test_a_torque_without_times_grows_with_the_load_steps(rig):
     assert tied.before == tied.after == 3e-3
 
 
+@pytest.mark.ci
 def test_a_torque_turns_far_in_one_step():
     """Within a step the tangent had the directions of its beginning. A turn of 0.33 rad took 151 iterations and three
     cuts, and a turn of 0.25 rad of quadratic elements failed."""
@@ -244,6 +245,7 @@ def test_a_factorisation_is_refused(rig):
         lj.simulate(scene)
 
 
+@pytest.mark.ci
 def test_a_plate_swings_as_a_pendulum_with_second_order():
     """The amplitude is above 2 rad. When Newmark's method was applied to each node alone, the acceleration towards the
     axis was missing: the error grew, and steps failed.
@@ -293,6 +295,7 @@ def _turned(by: str) -> tuple[lj.Scene, RigidPlate]:
     return scene, plate
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("by", ["torque", pytest.param("angle", marks=pytest.mark.slow)])
 def test_the_mesh_error_of_a_plate_on_quadratic_elements(by):
     """The cubic functions of the estimate turned with the plate, as if they were nodes at the origin. The estimate was

@@ -25,6 +25,7 @@ R, H = 0.01, 0.01
 COARSE, FINE = glued.Cells(rim=0.3, edge=0.3, growth=2.0), glued.Cells(rim=0.02, edge=0.01, growth=0.5, corners=32)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("times", [(0.1,), pytest.param((0.1, 0.05), marks=pytest.mark.slow)], ids=["one", "two"])
 def test_creep_is_that_of_the_standard_linear_solid(times, verified):
     """All stress relaxes equally, so a small strain creeps as 1/(1-g) - g/(1-g) exp(-t (1-g)/tau), averaged over the

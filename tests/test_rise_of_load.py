@@ -32,6 +32,7 @@ def test_a_small_movement_before_a_step_is_no_traceback(tmp_path, capsys, toe):
     assert "If the change was a step at" in capsys.readouterr().err
 
 
+@pytest.mark.ci
 def test_a_straight_ramp_at_irregular_times_has_no_jump_and_no_scatter(tmp_path):
     """Rows at random times in a linear ramp: half of such files had a jump, or a scatter of their strain."""
     for seed in range(20):
@@ -51,6 +52,7 @@ def test_a_jump_beside_a_short_interval_is_found():
     assert list(TimeTest("relaxation", time, strain, strain, time > 0).jumps) == [2]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("seed", range(3))
 def test_a_response_of_pure_noise_does_not_set_the_starts_of_a_fit(seed):
     """In creep at 100 Hz, the response in the first row of the ramp was noise: an apparent modulus of a sixth of the

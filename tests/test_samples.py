@@ -93,6 +93,7 @@ def test_errors_that_explain_the_spread_leave_none():
     assert population(np.array([1.0, 2.0]), np.array([0.1, np.inf])) is None
 
 
+@pytest.mark.ci
 def test_intervals_cover_the_mean_and_a_new_sample():
     rng, s = np.random.default_rng(0), 0.4
     draws, inside = 600, np.zeros(2)

@@ -28,6 +28,7 @@ def measured(G: np.ndarray, degrees: float, seed: int) -> Sweep:
     return some(Sweep(OMEGA, G.real, G.imag), G.imag > 0)
 
 
+@pytest.mark.ci
 def test_an_error_of_the_phase_no_longer_moves_the_numbers():
     """The phase error is one degree, and tan(delta) is 0.01 to 0.1. Before, ratios scattered twice as much, and the
     first ratio was 10 % too small.
@@ -64,6 +65,7 @@ def test_the_reader_weighs_by_the_scatter_and_says_so(tmp_path):
     assert not any("misses the data" in w or "not noise" in w for w in fit.warnings)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("repeats", [3, pytest.param(50, marks=pytest.mark.slow)])
 def test_deviations_of_few_repeats_do_not_choose_the_points(repeats):
     """The points are means of three with their errors. Before, 63 to 82 % of 95 % intervals contained the truth, and
@@ -84,6 +86,7 @@ def test_deviations_of_few_repeats_do_not_choose_the_points(repeats):
     assert np.mean(hits) >= 0.88 and np.mean(hits, axis=0).min() >= 0.8 and told <= 4
 
 
+@pytest.mark.ci
 def test_points_left_keep_the_weights_of_all_points():
     """If they were smoothed again, deviations of three repeats would let the ends decide 48 % of the fits of nine
     points.

@@ -140,6 +140,7 @@ def test_command_leaves_hdf5_vtu_and_a_picture(folder, capsys):
     assert (out / "result.png").stat().st_size > 10_000
 
 
+@pytest.mark.ci
 def test_a_failed_step_is_exit_code_1_and_keeps_what_was_computed(tmp_path, capsys):
     text = (
         SCENE.split("[viscosity]")[0].split("[[law]]")[0]
@@ -252,6 +253,7 @@ def test_files_that_are_no_scenes(text, tmp_path, capsys):
     assert error.startswith("error: ") and error.count("\n") == 1
 
 
+@pytest.mark.ci
 def test_a_mesh_file_with_sets_and_units(tmp_path):
     mesh = lj.shapes.box((100.0, 100.0, 100.0), (2, 2, 2))
     lj.write_mesh(tmp_path / "cube.vtu", mesh)

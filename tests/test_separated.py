@@ -31,6 +31,7 @@ def model(scene):
     return lj.separate(scene, RANGES, points=4, tolerance=1e-5)
 
 
+@pytest.mark.ci
 def test_the_error_at_unseen_runs_is_stated(scene, model):
     assert model.left_out < 1e-5 and model.error.shape == (8,)
     for mu, g in ((612.0, -1.45), (750.0, -0.7), (890.0, -0.25)):
@@ -131,6 +132,7 @@ def test_scenes_with_time_and_values_outside_are_refused(scene, model):
         lj.separated_displacement(model, {"law.mu": 700.0})
 
 
+@pytest.mark.ci
 def test_a_body_that_does_not_move_is_refused(scene):
     """The error of the terms was 0/0."""
     with pytest.raises(lj.InputError, match="no training run moves the body"):

@@ -90,6 +90,7 @@ def test_an_elastic_state_has_no_memory():
     assert np.abs(one - two).max() < 1e-8 * 0.03
 
 
+@pytest.mark.ci
 def test_static_solution_and_reactions_balance():
     scene = sheared(2)
     mesh = scene.mesh
@@ -108,6 +109,7 @@ def test_static_solution_and_reactions_balance():
     assert np.all(np.asarray(result.statistics.residual) <= 1e-8)
 
 
+@pytest.mark.ci
 def test_gravity_and_traction_are_carried_by_the_support():
     mesh = box()
     face = boundary.boundary_triangles(mesh, boundary.select(mesh, {"z_min": 0.1}))
@@ -123,6 +125,7 @@ def test_gravity_and_traction_are_carried_by_the_support():
     assert np.allclose(support, [-0.3, 0.0, 1.0 + 1060 * 1e-3 * 9.81], rtol=1e-7, atol=1e-7)
 
 
+@pytest.mark.ci
 def test_a_far_motion_is_cut_into_parts_and_a_hopeless_one_is_told():
     mesh = box()
 
@@ -162,6 +165,7 @@ def march(scene: lj.Scene, runs: tuple[int, ...], duration: float, start: jax.Ar
     return results
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("integrator", "order"), [pytest.param("euler", 1, marks=pytest.mark.slow), ("newmark", 2)])
 def test_order_of_the_integrators(integrator, order, verified):
     mesh = box()
@@ -299,6 +303,7 @@ def held_and_moved(mesh: lj.TetMesh, **motion) -> dict:
     }
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("name", [pytest.param("neo-Hookean", marks=pytest.mark.slow), "Veronda-Westmann"])
 def test_positions_and_reactions_of_febio(febio, name, verified):
     mesh = febio_cube(febio)
@@ -312,6 +317,7 @@ def test_positions_and_reactions_of_febio(febio, name, verified):
     assert moved < 1e-6 and force < 1e-6
 
 
+@pytest.mark.ci
 def test_viscous_ramp_and_hold_of_febio(febio, verified):
     mesh = febio_cube(febio)
     theirs = np.loadtxt(febio / "b_visco_neo-Hookean_dt0.0025.csv", delimiter=",")

@@ -238,6 +238,7 @@ def test_an_oblique_plane_has_a_force_along_its_normal_alone():
     assert np.allclose(sum(found.values()), -turn @ [0.2, 0.0, 1.0], atol=1e-6)
 
 
+@pytest.mark.ci
 def test_a_derivative_that_moves_no_node_is_finite():
     """A body between plates that relaxes everywhere alike keeps its shape, so the forces are linear in the ratio of its
     relaxation. The right-hand side of the derivative's linear solve is roundoff, of which a part was along the normal

@@ -63,6 +63,7 @@ def content(file) -> dict[str, bytes]:
         return {name: value[()].tobytes() for name, value in out.items()}
 
 
+@pytest.mark.ci
 def test_a_batch_is_the_loop_and_a_lane_that_fails_spoils_no_other(files):
     scene = lj.load_scene(files / "scene.toml")
     density = jnp.array([1000.0, 1e12, 1100.0])  # the second body falls too far for every law
@@ -168,6 +169,7 @@ def test_resumed_results_have_the_same_bytes(files):
     assert sweep.run(table, out, resume=True).computed == 0  # all chunks are present
 
 
+@pytest.mark.ci
 def test_killed_and_resumed(files):
     """The process is killed by signal 9 after the first chunk."""
     whole, out = files / "whole.h5", files / "killed.h5"
@@ -205,6 +207,7 @@ def test_several_processes_share_a_sweep(files):
     assert content(out) == content(files / "whole.h5")
 
 
+@pytest.mark.ci
 def test_failed_rows_are_listed_and_run_again_alone(files, capsys):
     (files / "rows.csv").write_text("law.mu,body.density\n700,1000\n700,1e12\n720,1000\n")
     assert main(command(files)) == 1

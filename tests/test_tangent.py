@@ -42,6 +42,7 @@ def test_pattern_names_every_neighbour_once():
         assert (ends == node).any(axis=0).all() and (ends[0] < ends[1]).all()
 
 
+@pytest.mark.ci
 def test_assembled_stiffness_is_the_sparse_one():
     scene = lj.Scene(mesh=MESH, law=LAW)
     e = equations(scene, initial_state(scene), 1.0)
@@ -51,6 +52,7 @@ def test_assembled_stiffness_is_the_sparse_one():
     assert np.abs(np.stack(block_matrix.product(A, V.T), axis=-1) - expected).max() < 1e-13 * abs(K).max() * 10
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("part", [pytest.param("all", marks=pytest.mark.slow), "isochoric"])
 def test_viscous_and_porous_tangent_against_autodiff(part):
     prony = lj.Prony(ratios=PRONY.ratios, relaxation_times=PRONY.relaxation_times, part=part)
@@ -79,6 +81,7 @@ def test_viscous_and_porous_tangent_against_autodiff(part):
     assert np.abs(error).max() < 1e-12 * np.abs(np.asarray(expected)).max()
 
 
+@pytest.mark.ci
 def test_coupled_matrix_against_autodiff():
     scene = lj.Scene(mesh=MESH, law=LAW, porosity=SPONGE, solve=lj.Solve(dt=0.05))
     law = porosity.law_in_force(SPONGE, LAW)
@@ -107,6 +110,7 @@ def test_coupled_matrix_against_autodiff():
         assert np.abs(ours[:, column] - exact[:, column]).max() < 1e-12 * np.abs(exact[:, column]).max()
 
 
+@pytest.mark.ci
 def test_darcys_laplacian_and_its_polynomial():
     fluid = porosity.initial_fluid(SPONGE, MESH)
     flow = jax.jit(lambda: darcy.flow(SPONGE, MESH, fluid.J, deformation_gradient(MESH, X), 0.05, 1e-10))()
@@ -125,6 +129,7 @@ def test_darcys_laplacian_and_its_polynomial():
         assert eigenvalues.min() > least and eigenvalues.max() < 1.1
 
 
+@pytest.mark.ci
 def test_pressures_from_a_guess():
     """A guess changes neither pressures nor derivatives. With a close guess, a looser solve is equally exact."""
     sponge = replace(SPONGE, drained=MESH.node_sets["z_max"])
@@ -144,6 +149,7 @@ def test_pressures_from_a_guess():
         assert np.isclose(again, plain, rtol=1e-8) and np.isclose(same, slope, rtol=1e-8)
 
 
+@pytest.mark.ci
 def test_chebyshev_meets_its_bound():
     d = jnp.asarray(rng.uniform(1, 2, 30))
     Q = np.linalg.qr(rng.standard_normal((30, 30)))[0]

@@ -15,6 +15,7 @@ def thick(shape: str) -> Indenter:
     return Indenter(shape, 1e3, 0.3, radius=1e-3, half_angle=60.0)
 
 
+@pytest.mark.ci
 def test_on_a_thick_layer_the_force_is_that_on_a_half_space():
     """Compare with Hertz, Sneddon and Boussinesq, as published in handbooks."""
     d, plane, R = 1e-4, 1 - 0.3**2, 1e-3

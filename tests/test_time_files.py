@@ -261,6 +261,7 @@ def recorded(noise_of_strain=0.0, seed=0):
     return t, strain + noise_of_strain * 0.05 * rng.standard_normal(len(t)), stress
 
 
+@pytest.mark.ci
 def test_a_load_that_rises_between_two_rows_may_be_a_step(tmp_path, capsys):
     """After rest there is a step at the 11th row. A linear rise in the interval before gave G0 = 2815 ± 39 for
     2000 Pa.
@@ -281,6 +282,7 @@ def test_a_load_that_rises_between_two_rows_may_be_a_step(tmp_path, capsys):
     assert found["standard_errors"]["shear_modulus"] < 10
 
 
+@pytest.mark.ci
 def test_a_load_before_the_rows_may_be_a_step_at_the_beginning(tmp_path, capsys):
     """The first row is under load at 0.5 s. For a step at 0 s, G0 was 12 % too low, with a total error of 7 %."""
     t, noise = np.geomspace(0.5, 200, 120), 1 + 0.005 * np.random.default_rng(0).standard_normal(120)
@@ -337,6 +339,7 @@ def test_rest_before_the_load_and_a_strain_that_scatters_do_not_matter(tmp_path,
     assert f.modes == 2 and np.allclose(f.uncertainty.values, [900, 0.3, 0.4, 5, 0.2], rtol=0.08 if noise else 0.03)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("noise", [pytest.param(0.003, marks=pytest.mark.slow), 0.01])
 def test_a_ramp_that_scatters_gives_what_the_exact_ramp_gives(tmp_path, noise):
     """The ramp takes 1 s. Each reading counted as a step, and G0 was 15 % too low, by 5 standard errors, without a

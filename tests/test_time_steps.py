@@ -40,6 +40,7 @@ def tops(run: lj.Result) -> jnp.ndarray:
 WAVE = {"kind": "dynamic", "rise": 0.02}
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("dt", "options", "order"),
     [
@@ -127,6 +128,7 @@ def test_a_run_that_fails_is_no_noise():
     assert sizes == [{}] and np.array_equal(same.data[0].sd, data[0].sd)
 
 
+@pytest.mark.ci
 @pytest.mark.filterwarnings("ignore:the error of the mesh changes")
 def test_a_fit_states_what_its_time_step_does_to_the_numbers():
     """The data come from steps of 1/32. Ratio and relaxation time are wrong by more than their standard errors, as

@@ -135,6 +135,7 @@ def test_what_an_ode_solver_computed_is_recovered_from_the_file(kind, tmp_path):
     assert step.relative_errors.mean() > 0.01 > 1e3 * f.relative_errors.mean()
 
 
+@pytest.mark.ci
 @pytest.mark.draws
 def test_a_fluid_is_told_from_a_solid(tmp_path):
     t, rng = np.geomspace(0.02, 60, 60), np.random.default_rng(0)
@@ -179,6 +180,7 @@ def test_relaxation_of_polystyrene_is_predicted_from_its_creep():
     assert np.median(error) < 0.1
 
 
+@pytest.mark.ci
 def test_a_melt_with_little_left_is_compared_with_a_fluid():
     """In a melt, the structured misfit left an equilibrium modulus of 2.1 errors, and no fluid was tried."""
     folder = SHARED / "data" / "rheology" / "pyrheo"
@@ -241,6 +243,7 @@ def test_as_many_rows_as_allowed_are_fitted(time, ramp, first):
     assert len(rows) == fits.MOST and np.all(np.diff(rows) > 0) and rows[-1] == len(time) - 1
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("kind", ["relaxation", pytest.param("creep", marks=pytest.mark.slow)])
 def test_a_test_without_relaxation_is_told_with_its_modulus(kind):
     """Before, six of such tests became fluids with times of 1e175 s, or did not converge, with the advice of fewer

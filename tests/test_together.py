@@ -66,6 +66,7 @@ def test_a_start_from_which_no_joint_fit_begins_is_refused(tests, start, words):
         joint.fit(tests, start, lj.laws.create("neo_hookean", mu=770.0, bulk=7700.0))
 
 
+@pytest.mark.ci
 def test_the_noise_of_every_test_is_found_if_it_differs_a_thousandfold():
     """After three rounds, the weights of the tests had not settled: G0 was wrong by up to 5.1 standard errors."""
     truth = Maxwell(np.float64(2000.0), np.array([0.2, 0.3, 0.3]), np.array([0.01, 0.3, 10.0]))
@@ -87,6 +88,7 @@ def test_the_noise_of_every_test_is_found_if_it_differs_a_thousandfold():
     assert np.sqrt(np.mean(np.square(off))) < 2
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("points", [4, pytest.param(8, marks=pytest.mark.slow)])
 def test_the_noise_of_a_short_test_does_not_run_to_zero(points):
     """Parameters can fit a few values exactly. Their noise then fell in every round, and their weight grew without
@@ -203,6 +205,7 @@ def test_a_factor_of_all_tests_is_one_of_the_shear_modulus_alone():
     assert np.allclose(moved.sum(axis=1), [1000, 0, 0], atol=[5, 5e-3, 5e-2])
 
 
+@pytest.mark.ci
 def test_a_small_factor_between_the_tests_is_named_too():
     """A factor of 5 % is absorbed by the ratios. Each test is fitted nearly as well as alone."""
     fit = springpots_in_time.choose_together(wide_and_long(1.05, 0), "prony", 2)
@@ -288,6 +291,7 @@ def test_tests_that_do_not_agree_are_named():
     assert any("the tests do not agree" in w and "otherwise try more modes" in w for w in told)
 
 
+@pytest.mark.ci
 def test_tests_that_do_not_agree_in_a_spectrum_need_another_model():
     """The advice was to try more modes, which the program refuses for --model spectrum."""
     told = springpots_in_time.choose_together([sweep(0.02), relaxation(0.005, 1.4)], "spectrum").warnings
@@ -308,6 +312,7 @@ def test_shear_waves_of_several_tests_have_the_given_density(tmp_path):
     assert json.loads((tmp_path / "fit.json").read_text())["shear_waves"]["density_kg_m3"] == 2000
 
 
+@pytest.mark.ci
 @pytest.mark.draws
 def test_the_command_reads_any_test(tmp_path, capsys):
     s, creep_time = sweep(0.01), np.geomspace(1, 100, 20)
@@ -417,6 +422,7 @@ def with_deviations(stated: float, noise: float, springpot: bool = False) -> Swe
     return Sweep(WIDE, *noisy, *(stated * noisy), source="stated.csv")
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     "model", ["prony", *(pytest.param(m, marks=pytest.mark.slow) for m in ("fractional", "spectrum"))]
 )
@@ -449,6 +455,7 @@ def test_the_mean_error_is_not_above_the_largest_one(tmp_path):
     assert content["tests"][0]["misfit_by_itself"] == pytest.approx(0.02, rel=0.4)
 
 
+@pytest.mark.ci
 def test_a_joint_fit_of_one_sweep_has_the_errors_of_its_closed_form():
     """Without stated deviations, the noise is the residual of the closed form, not the size of the moduli."""
     data = with_deviations(0.05, 0.02)._replace(storage_sd=None, loss_sd=None)

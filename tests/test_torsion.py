@@ -60,6 +60,7 @@ def _amplitude(rig, by):
 CASES = [pytest.param(*c, marks=pytest.mark.slow) for c in (("chapter", "torque"), ("exponential", "angle"))]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("scheme", "by"), [("exponential", "torque"), *CASES])
 def test_cycle_answers_the_discrete_formula(rig, law, prony, scheme, by, verified):
     prony = replace(prony, scheme=scheme)
@@ -81,6 +82,7 @@ def test_from_rest_the_transient_dies_to_the_same_answer(rig, law, prony):
     assert np.abs(_complex(m) / _discrete(prony, OMEGA[1:2], 50) - 1).max() < 1e-6
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("scheme", "order"), [("exponential", 2), pytest.param("chapter", 1, marks=pytest.mark.slow)])
 def test_observed_order_in_time(rig, law, prony, scheme, order, verified):
     prony = replace(prony, scheme=scheme)
@@ -96,6 +98,7 @@ def test_observed_order_in_time(rig, law, prony, scheme, order, verified):
     assert off < 0.15, rates
 
 
+@pytest.mark.ci
 def test_geometry_factor_converges_at_second_order(law, verified):
     # These cell sizes divide the sample evenly, so that every mesh is twice as fine in each direction.
     excess = [float(torsion.geometry_factor(torsion.make_rig(cell_size=0.004 / n), law)) - 1 for n in (1, 2, 4)]
@@ -141,6 +144,7 @@ def test_a_hundred_nodes_are_enough_at_small_strain(law, prony, radius, height):
     assert np.allclose(m.bias, torsion.geometry_factor(rig, law), rtol=1e-9)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("part", "density"),
     [("all", 1060.0), *(pytest.param(part, None, marks=pytest.mark.slow) for part in ("all", "isochoric"))],
@@ -235,6 +239,7 @@ def test_inertia_is_taken_off_and_put_back():
         sample_inertia.taken_off(Sweep(omega, 0 * omega + 1.0, 0 * omega - 50.0), 1060.0, 0.008)
 
 
+@pytest.mark.ci
 def test_the_linear_derivative_passes_through_any_model_and_its_prior(monkeypatch, law):
     """If the simulation is replaced by the linear rig, both derivatives are equal; here for a fluid with a prior."""
     kind = viscoelastic.FLUID._replace(prior=lambda u: 3 * u[1:] ** 2)
@@ -302,6 +307,7 @@ def test_reverse_mode_agrees_with_forward_mode(rig, law, prony):
     assert np.allclose(jax.jit(jax.grad(loss))(tau), jax.jit(jax.jacfwd(loss))(tau), rtol=1e-8)
 
 
+@pytest.mark.ci
 def test_torque_history_against_febio(febio, prony, verified):
     points, rows = (
         np.loadtxt(febio / "cyl_nodes.csv", delimiter=","),
@@ -352,6 +358,7 @@ def test_inertia_against_the_torsional_wave(law, prony, cell_size, verified):
         assert abs(_complex(m)[0] / G - 1) < 5e-3
 
 
+@pytest.mark.ci
 def test_state_holds_only_the_physics_there_is(rig, law, prony):
     def carried(rig, prony):
         drive = Drive()
@@ -364,6 +371,7 @@ def test_state_holds_only_the_physics_there_is(rig, law, prony):
     assert len(carried(replace(rig, density=1000.0), None)) == 1 + 2  # velocity and acceleration
 
 
+@pytest.mark.ci
 def test_strain_sweep_finds_where_linearity_ends(rig):
     strains = np.array([1e-4, 1e-3, 1e-2, 0.05, 0.1, 0.2])
     soft = lj.laws.NeoHookean(mu=770.0, bulk=7.7e4)
@@ -387,6 +395,7 @@ def test_the_end_of_linearity_needs_finite_moduli():
     assert np.isnan(torsion.linearity_limit(strains, [np.nan, 700.0, 700.0]))
 
 
+@pytest.mark.ci
 def test_free_plate_rises(law):
     rig = torsion.make_rig(cell_size=0.004, free_height=True)
     angle = 0.2 * 0.004 / 0.010

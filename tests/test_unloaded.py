@@ -49,6 +49,7 @@ def there_and_back(scene: lj.Scene) -> None:
     assert np.linalg.norm(back) < 10 * 2 * TOLERANCE * np.linalg.norm(moved)
 
 
+@pytest.mark.ci
 def test_there_and_back():
     """Linear elements. For a load that is far too large there is no reference shape, and a message says so."""
     scene = scene_from(content())

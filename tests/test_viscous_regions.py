@@ -69,6 +69,7 @@ def test_what_a_region_leaves_out_stays():
     np.testing.assert_allclose(lj.simulate(block(region=(times,))).check().reactions, expected, atol=1e-15)
 
 
+@pytest.mark.ci
 def test_harmonic_motion_takes_the_region_as_factors():
     mesh = block().mesh
     below = lower(mesh)

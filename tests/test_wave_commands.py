@@ -46,6 +46,7 @@ def written(tmp_path, ending, field):
     return path
 
 
+@pytest.mark.ci
 @pytest.mark.draws
 def test_the_command_writes_regions_and_a_map_and_goes_on(tmp_path, capsys):
     labels = np.ones((7, 7, 9), int)
@@ -71,6 +72,7 @@ def test_the_command_writes_regions_and_a_map_and_goes_on(tmp_path, capsys):
     assert "map: chi2" in capsys.readouterr().out
 
 
+@pytest.mark.ci
 def test_a_large_organ_is_fitted_in_parts(tmp_path, monkeypatch, capsys):
     """Regions, edges, the map and its files extend across the parts."""
     from fitting.commands import waves
@@ -103,6 +105,7 @@ def test_a_large_organ_is_fitted_in_parts(tmp_path, monkeypatch, capsys):
     assert "--stride 1 needs more than" in capsys.readouterr().err
 
 
+@pytest.mark.ci
 def test_regions_of_a_run_that_was_killed_are_not_searched_for_again(tmp_path, monkeypatch):
     """The run was killed during the map. The regions are read from their file, bit by bit, and only for the
     same waves.
@@ -133,6 +136,7 @@ def test_regions_of_a_run_that_was_killed_are_not_searched_for_again(tmp_path, m
     assert command.main([*ask, "--resume", "--no-map"]) == 2
 
 
+@pytest.mark.ci
 def test_too_few_balances_and_a_length_in_millimetres_are_refused(tmp_path, capsys):
     """4 x 4 x 4 voxels have one brick, with fewer balance equations than pressures."""
     path = written(tmp_path, ".npz", plane_waves((4, 4, 4)))
@@ -156,6 +160,7 @@ def test_a_progress_file_that_is_none_gets_a_sentence(tmp_path):
             stiffness_map._first_or_resumed(course, file)
 
 
+@pytest.mark.ci
 def test_a_map_that_was_stopped_goes_on_to_the_same_end(tmp_path, monkeypatch):
     """The run stops at the second deviation of the prior. The first one is evaluated again, with the same numbers as
     without a stop.

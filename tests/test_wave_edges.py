@@ -39,6 +39,7 @@ def organ_of(field):
     return elastography.organ_of(field, elastography.body_of(field), DENSITY)
 
 
+@pytest.mark.ci
 def test_the_series_is_continuous_and_in_balance():
     """Check by differences: -omega^2 rho u = div(stress), so curl(u) satisfies Helmholtz's equation on each side."""
     omega, h = 2 * np.pi * 80.0, 2e-5
@@ -58,6 +59,7 @@ def test_the_series_is_continuous_and_in_balance():
     np.testing.assert_allclose(pair[0], pair[1], rtol=1e-5)
 
 
+@pytest.mark.ci
 def test_sheared_layers_are_in_balance():
     """Simple shear across a plane edge at any position in the elements: strain jumps, stress does not, no force
     remains.
@@ -136,6 +138,7 @@ def test_a_small_label_leaves_the_edges_of_others_alone(radius):
     assert np.array_equal(own[far], labels[tuple(body.voxel.T)][far])
 
 
+@pytest.mark.ci
 def test_labels_whose_edges_cut_every_element():
     """A box of 3 voxels is inside one of 5, so no element lies in one region alone."""
     field = beside_a_cylinder(0.005, (3e-4, -4e-4), 2e-3, 60.0, voxels_across=5)
@@ -151,6 +154,7 @@ def test_a_region_without_an_error_has_its_row_in_the_table():
     assert [report._error_cell(x) for x in (None, 12.345)] == ["unknown", "12"]
 
 
+@pytest.mark.ci
 def test_the_derivative_by_the_edges_is_the_difference(monkeypatch):
     """chi^2 with edges shifted outwards by a fiftieth of a voxel, up to the second order that its Hessian contains."""
     monkeypatch.setattr(edge_places, "FARTHER", 0.02)
@@ -332,6 +336,7 @@ def test_what_labels_and_elements_do_to_a_cylinder(radius, most, edges_do, monke
     assert whole >= edges_do, off
 
 
+@pytest.mark.ci
 def test_the_errors_of_a_cylinder_are_those_of_repeated_noise():
     """Twelve measurements scatter as the standard errors state. Their ratio has a deviation of a fifth."""
     field = beside_a_cylinder(0.005, (3e-4, -4e-4), 2e-3, 100.0, noise=0.0, voxels_across=13)
@@ -348,6 +353,7 @@ def test_the_errors_of_a_cylinder_are_those_of_repeated_noise():
     assert 0.5 < np.std(np.real(moduli), ddof=1) / e.real < 1.6 and 0.5 < np.std(np.imag(moduli), ddof=1) / e.imag < 1.6
 
 
+@pytest.mark.ci
 def test_a_region_that_says_nothing_is_told(monkeypatch):
     field = beside_a_cylinder(0.005, (3e-4, -4e-4), 2e-3, 100.0, voxels_across=13)
     labels = field.labels.copy()

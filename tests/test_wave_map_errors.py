@@ -72,6 +72,7 @@ def test_deviations_of_a_map_hold_the_truth_behind_a_filter(width):
     assert np.mean(held) > 0.86
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("modulus", [_edge, _modulus, lambda z: np.full(np.shape(z), 3000 + 900j)])
 def test_edges_in_a_map_are_told(modulus):
     """Near an edge, 90 % intervals may contain fewer than 90 % of the true values."""

@@ -58,6 +58,7 @@ def test_a_frequency_of_noise_alone_is_named_and_a_number_at_its_bound():
     assert "4.3 % off on average: exponent = 1 (at its bound), springpot = 2 ± 0.1" in last
 
 
+@pytest.mark.ci
 def test_too_large_a_noise_is_told():
     field = plane_waves((7, 7, 7), noise=1e-7)
     for factor, told in ((1, False), (10, True)):

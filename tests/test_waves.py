@@ -73,6 +73,7 @@ def test_a_hole_in_the_mask_takes_away_its_bricks_and_their_inner_nodes():
     assert whole.inner.sum() - body.inner.sum() == 2**3
 
 
+@pytest.mark.ci
 def test_the_block_solver_is_that_of_the_whole_matrix(small):
     m = small.matrices
     found = balance.balanced(
@@ -130,6 +131,7 @@ def test_moduli_of_plane_waves_within_their_errors(small, verified):
     )
 
 
+@pytest.mark.ci
 def test_noise_does_not_pull_the_modulus_down_and_the_errors_are_right():
     """Forty measurements with 5 % of noise: (found - true) / error has mean 0 and deviation 1."""
     first = organ((7, 7, 7), noise=5e-7)
@@ -253,6 +255,7 @@ def test_deviations_of_a_modulus_are_those_of_samples():
     np.testing.assert_allclose(found.imag, samples.imag.std(axis=0), rtol=0.03)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("axis", [0, *(pytest.param(axis, marks=pytest.mark.slow) for axis in (1, 2))])
 def test_the_error_of_long_voxels_is_that_of_the_waves_that_cross_them(axis):
     """Voxels are twice as long along the direction of the wave as across it. The estimate is the wave's error for each
@@ -273,6 +276,7 @@ def test_the_error_of_long_voxels_is_that_of_the_waves_that_cross_them(axis):
     assert np.all(np.abs(found.mesh_bias - error) < 0.25 * np.abs(error))
 
 
+@pytest.mark.ci
 def test_each_region_has_the_error_of_waves_of_its_own_length():
     """A soft region is beside a stiff one. The estimate with the modulus of the whole organ was a sixth of its
     error.
@@ -364,6 +368,7 @@ def test_errors_of_smoothed_noise_hold_the_truth(width):
     assert np.sqrt(np.mean(np.square(off))) < 1.8  # six numbers: 1 with a deviation of 0.29
 
 
+@pytest.mark.ci
 def test_a_hole_in_the_mask_is_in_the_mesh_bias():
     """Without noise, the elements alone cause an error of 0.15 %, and with a hole 1.2 %. Half of it is found. The
     measured waves are a sum whose parts add up at the hole; the estimate treats each wave separately.
