@@ -248,6 +248,34 @@ def test_a_set_of_the_assembly_may_have_a_name_before_it(tmp_path, name):
     assert sorted(np.ravel(mesh.triangle_sets["faces"]).tolist()) == [1, 2, 4]
 
 
+def test_a_name_after_that_of_the_assembly_means_its_set(tmp_path):
+    """The part has sets with the same names, and these were used."""
+    head = HEAD.replace("*Node, nset=all", "*Part, name=Liver\n*Node, nset=all")
+    cards = """*Nset, nset=tip
+11
+*Elset, elset=low
+101
+*End Part
+*Assembly, name=Model
+*Instance, name=Liver-1, part=Liver
+*End Instance
+*Nset, nset=tip, instance=Liver-1
+15
+*Elset, elset=low, instance=Liver-1
+102
+*Nset, nset=nodes, elset=Model.low
+*Nset, nset=tips
+Model.tip
+*Nset, nset=own
+Liver-1.tip, Model.Liver-1.tip
+*End Assembly
+"""
+    (tmp_path / "m.inp").write_text(head + cards)
+    mesh = lj.read_mesh(tmp_path / "m.inp")
+    found = {name: sorted(np.asarray(mesh.node_sets[name]).tolist()) for name in ("nodes", "tips", "own")}
+    assert found == {"nodes": [1, 2, 3, 4], "tips": [4], "own": [0]}
+
+
 def test_quadratic_elements_and_included_files(tmp_path):
     mesh = lj.quadratic(lj.shapes.box((1, 1, 1), (1, 1, 1)))
     meshio.Mesh(np.asarray(mesh.points), [meshio_cells(mesh)]).write(tmp_path / "inner.inp")

@@ -2,12 +2,14 @@
 
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.sparse.linalg
 
 import liverjax as lj
+from fitting.fits import scene_numbers
 from liverjax.core import status
 from liverjax.core.struct import replace
 from liverjax.jobs.sweep import _failures
@@ -103,3 +105,16 @@ def test_a_dynamic_step_of_one_solve_has_the_loads_and_motions_at_its_end():
     run = lj.simulate(replace(scene, body=still, physics=(wall,), traction=(pull,)))
     assert np.all(np.abs(np.asarray(run.positions[0] - scene.mesh.points)).max(axis=0)[:2] > 1e-9)
     assert np.asarray(run.statistics.residual).max() < 1e-3
+
+
+def test_the_most_severe_code_is_not_the_largest(monkeypatch):
+    """The largest code of a fit's run was reported, so one step hid steps that were not finite or that stalled."""
+    codes = np.array([[8, 1, 0], [5, 2, 4], [0, 8, 0], [0, 0, 0]])
+    expected = [status.STALLED, status.NOT_FINITE, status.ONE_STEP, status.CONVERGED]
+    assert jax.jit(lambda c: status.most_severe(c, axis=1))(codes).tolist() == expected
+    assert sorted(status.SEVERITY) == sorted(status.ADVICE)
+    run = SimpleNamespace(status=jnp.array([8, 2]), positions=None)
+    monkeypatch.setattr(scene_numbers.lj, "simulate", lambda scene, store: run)
+    monkeypatch.setattr(scene_numbers, "weighted_differences", lambda *_: jnp.zeros(1))
+    problem = scene_numbers.Problem((hanging(),), (None,))
+    assert scene_numbers.misfit(problem, {})[1].tolist() == [status.NOT_FINITE]

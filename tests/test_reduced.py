@@ -1,5 +1,7 @@
 """Reduced models: the full model in other coordinates, their structure, their error, and unsupported scenes."""
 
+from types import SimpleNamespace
+
 import h5py
 import jax
 import jax.numpy as jnp
@@ -8,6 +10,7 @@ import pytest
 from conftest import every_motion, moves_as_full
 
 import liverjax as lj
+from liverjax.core import status
 from liverjax.core.struct import replace
 from liverjax.mesh.nodal import nodal_volumes
 from liverjax.physics.prescribed import free_degrees
@@ -54,11 +57,35 @@ def test_the_error_of_a_body_that_is_about_to_buckle():
     assert 0.5 < float(lj.reduced_error(model, pressed, run).error.max()) / true < 2
 
 
+@pytest.mark.parametrize("order", [1, 2])
+def test_the_compliance_of_the_selection_of_points_has_regions(order):
+    """The changes of the law in regions were not used, so motions were up to ten times too large in a stiff region."""
+    scene, stiff = _bar((3, 1, 1), order), np.arange(9)
+    mu = jnp.full(scene.mesh.number_of_elements, 800.0).at[stiff].set(8000.0)
+    scene = replace(scene, region=(lj.Region(elements=stiff, law={"mu": 8000.0}),))
+    modes = SimpleNamespace(modes=every_motion(scene), number_of_modes=len(every_motion(scene)))
+    found = sampling._reduced_compliance(modes, scene)
+    same = replace(scene, region=(), law=replace(scene.law, mu=scene.mesh.at_points(mu)))
+    np.testing.assert_allclose(found, sampling._reduced_compliance(modes, same), rtol=1e-9)
+
+
 @pytest.mark.parametrize("factor", [np.nan, 0.0, -1.0])
 def test_a_reduced_run_that_failed_has_no_small_error(factor):
     """The deformed body may have no stiffness that can be factorised."""
     scene, r = _bar((3, 1, 1)), np.ones((16, 3))
     assert estimate._softening(scene, r, factor * scene.mesh.points) == np.inf
+
+
+@pytest.mark.ci
+def test_a_reduced_step_that_stalled_is_not_called_inverted():
+    """The code of inverted elements says that equilibrium was reached, and was given without equilibrium too."""
+    scene = _bar((1, 1, 1), solve=lj.Solve(newton_iterations=1))
+    scene = replace(scene, body=lj.Body(density=1000.0, gravity=jnp.array([-2000.0, 0.0, 500.0])))
+    model = with_all_points(scene, every_motion(scene))
+    found = lj.simulate_reduced(model, scene)
+    F = jnp.eye(3).reshape(9, 1) + model.slopes @ found.coordinates[0]
+    assert np.linalg.det(np.moveaxis(np.asarray(F).reshape(3, 3, -1), -1, 0)).min() < 0
+    assert float(found.residual[0]) > scene.solve.tolerance and found.status.tolist() == [status.STALLED]
 
 
 @pytest.mark.ci

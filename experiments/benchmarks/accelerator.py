@@ -81,7 +81,7 @@ def of_lanes(found: jax.Array) -> tuple[np.ndarray, dict]:
 def of_run(result: lj.Result) -> tuple[np.ndarray, dict]:
     """Return the positions, and residual, status and iterations of Newton's method."""
     s, steps = result.statistics, len(result.times)
-    worst = status.NAMES[int(np.max(np.asarray(result.status)))]
+    worst = status.NAMES[int(status.most_severe(result.status))]
     told = {"residual": float(np.max(np.asarray(s.residual))), "code": worst}
     told |= {"linear_per_step": float(np.sum(np.asarray(s.linear_iterations))) / steps}
     return np.asarray(result.positions, float), told

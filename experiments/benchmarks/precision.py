@@ -76,7 +76,7 @@ def static(cells: int) -> list[dict]:
 
 def code(result: lj.Result) -> str:
     """Return the worst status of all steps."""
-    return status.NAMES[int(np.max(np.asarray(result.status)))]
+    return status.NAMES[int(status.most_severe(result.status))]
 
 
 def liver(steps: int) -> list[dict]:

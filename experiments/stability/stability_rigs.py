@@ -74,7 +74,7 @@ def row(test: str, aspect: float, cells: glued.Cells, ratios: tuple[float, ...])
                 "elements": rig.scene.mesh.number_of_elements,
                 "nodes": rig.scene.mesh.number_of_nodes,
                 "error": value / unit / known(test, aspect, ratio) - 1,
-                "code": status.NAMES[int(np.max(codes))],
+                "code": status.NAMES[int(status.most_severe(codes))],
                 "run_s": float(np.median(seconds)) / len(readings),
                 "compile_s": compiling,
             }

@@ -70,7 +70,7 @@ def torsion_sweep(data: Sweep, rig: torsion.Rig, torque: Number, drive: torsion.
 
     def predict(law, viscosity, model):
         found = torsion.moduli(rig, law, viscosity, omega, torque, drive)
-        return jnp.concatenate([found.storage, found.loss]), jnp.max(found.statistics.status)
+        return jnp.concatenate([found.storage, found.loss]), status.most_severe(found.statistics.status)
 
     def errors(law, viscosity):
         exact, found = (torsion.linear_moduli(law, viscosity, omega, steps) for steps in (None, drive.steps))
@@ -115,7 +115,7 @@ def through(name: str, rig: glued.Rig, measured: Numbers, sd: Numbers) -> Test:
 
     def predict(law, viscosity, model):
         readings, codes = glued.read(rig, law, viscosity)
-        return readings, jnp.max(codes)
+        return readings, status.most_severe(codes)
 
     return Test(name, predict, measured, sd, partial(glued.reading_errors, rig))
 

@@ -57,13 +57,13 @@ def check_data(problem: Problem) -> None:
 
 
 def misfit(problem: Problem, values: Mapping[str, object], store: str | int = "all") -> tuple[jax.Array, jax.Array]:
-    """Return the n residuals (n,) of all scenes for the parameters `values`, and the worst status code of each
-    scene. `store`: see `liverjax.simulate`."""
+    """Return the n residuals (n,) of all scenes for the parameters `values`, and the most severe status code of
+    each scene. `store`: see `liverjax.simulate`."""
     parts, codes = [], []
     for scene, data in zip(problem.scenes, problem.data, strict=True):
         result = lj.simulate(lj.with_parameters(scene, values), store=store)
         parts.append(weighted_differences(data, scene, result.positions))
-        codes.append(jnp.max(result.status))
+        codes.append(status.most_severe(result.status))
     return jnp.concatenate(parts), jnp.stack(codes)
 
 

@@ -284,7 +284,7 @@ def through_torsion(
     if isinstance(start.solution.u, np.ndarray):  # all later steps use NumPy, as the closed form does
         found = Solution(*(np.asarray(field) for field in found))
     storage, loss = np.asarray(m.storage), np.asarray(m.loss)
-    worst = int(np.asarray(m.statistics.status).max())
+    worst = int(status.most_severe(m.statistics.status))
     found = found._replace(converged=bool(found.converged) and worst == status.CONVERGED)
     details = _simulation_details(simulation, rig, law, m) | {"optimizer": optimizer}
     if rig.held is not None:
@@ -389,7 +389,7 @@ def _simulation_details(
         "rim_strain": simulation.strain,
         "newton_iterations": int(np.asarray(m.statistics.iterations).max()),
         "newton_residual": float(np.asarray(m.statistics.residual).max()),
-        "newton_status": status.advice(np.asarray(m.statistics.status).max()),
+        "newton_status": status.advice(int(status.most_severe(m.statistics.status))),
         "transient": float(np.asarray(m.defect).max()),
     }
 

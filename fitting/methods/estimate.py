@@ -29,7 +29,7 @@ class Estimate(NamedTuple):
     freedom: float  # components minus the (effective) number of unknowns
     iterations: int
     converged: bool
-    codes: tuple[int, ...] = ()  # worst status code of each simulation
+    codes: tuple[int, ...] = ()  # most severe status code of each simulation
     seconds: float = 0.0
     mesh_bias: np.ndarray | None = None  # (P,) error of the values due to the mesh; None: unknown
     time_step_bias: np.ndarray | None = None  # (P,) error of the values due to the time steps

@@ -42,9 +42,10 @@ class Displacements(NamedTuple):
 def read_displacements(path: str | Path, scene: Scene, noise: float | None = None, unit: str = "m") -> Displacements:
     """Read displacements from a CSV file with a header.
 
-    The columns are: ``node`` (index of the node), or ``x, y, z`` (position at rest); ``ux, uy, uz`` (empty if not
-    measured); ``time`` [s], if the scene has time steps (default: the last step); ``sd``, the standard deviation of the
-    noise. `#` begins a comment.
+    The columns are: ``node`` (index of the node in `scene.mesh`, from 0), or ``x, y, z`` (position at rest); ``ux, uy,
+    uz`` (empty if not measured); ``time`` [s], if the scene has time steps (default: the last step); ``sd``, the
+    standard deviation of the noise. `#` begins a comment. `liverjax.mesh.files.read_mesh` states when the indices of
+    the nodes differ from those in the mesh file. Then give ``x, y, z``.
 
     Args:
         path: CSV file.

@@ -29,7 +29,7 @@ from fitting.readers.time_tests import TimeTest, from_rest, of_columns, with_kno
 from fitting.rigs import glued, thin_layer
 from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
-from liverjax.core.status import NAMES
+from liverjax.core.status import NAMES, most_severe
 from liverjax.laws import NeoHookean
 
 #: Sizes that each test needs: lengths [m], and the half angle [degrees] of the cone.
@@ -319,8 +319,8 @@ def _glued_curve(described: Described, largest: float, path: str) -> tuple[Calla
         else:
             raise InputError(
                 f"{path}: the simulation of an elastic sample (radius {radius:g} m, height {height:g} m) fails before "
-                f"the displacement {largest:g} m ({NAMES[int(np.max(codes))]}); check the sizes, or give only rows of "
-                "smaller displacements"
+                f"the displacement {largest:g} m ({NAMES[int(most_severe(codes))]}); check the sizes, or give only "
+                "rows of smaller displacements"
             )
         left_out = np.asarray(glued.mesh_error(rig, law, None)) / 1e3
     found = np.asarray(force) / 1e3

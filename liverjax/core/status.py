@@ -1,5 +1,9 @@
 """Result codes of solves, and one sentence of advice for each code. Compiled programs return only the codes."""
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+
 CONVERGED = 0
 STALLED = 1
 NOT_FINITE = 2
@@ -44,6 +48,20 @@ NAMES = {
     ADJOINT_FAILED: "adjoint failed",
     ONE_STEP: "one step",
 }
+
+#: All codes, from the least to the most severe.
+SEVERITY = (
+    CONVERGED, ONE_STEP, STALLED, INVERTED, INDEFINITE, STEP_CUT, GRADIENT_UNCONVERGED, ADJOINT_FAILED, NOT_FINITE,
+)  # fmt: skip
+
+
+def most_severe(codes: jax.Array | np.ndarray, axis: int | None = None) -> jax.Array:
+    """Return the most severe of the codes, along one axis of the array or in the whole array (see `SEVERITY`).
+
+    The numbers of the codes are not in the order of severity, so the largest code is not always the most severe.
+    """
+    ranks = jnp.asarray(np.argsort(SEVERITY), jnp.int32)
+    return jnp.asarray(SEVERITY, jnp.int32)[jnp.max(ranks[jnp.asarray(codes, jnp.int32)], axis=axis)]
 
 
 def advice(code: int) -> str:

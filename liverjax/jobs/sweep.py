@@ -349,11 +349,8 @@ def _join(sweep: Sweep, out: Path, files: list[Path]) -> tuple[np.ndarray, np.nd
 
 
 def _failures(sweep: Sweep, codes: np.ndarray) -> dict[int, int]:
-    """Return {row number: code} of the runs that failed. If a run has failures and `ONE_STEP`, the failure is
-    returned."""
-    above = codes == status.ONE_STEP
-    worst = np.where(above, status.CONVERGED, codes).max(axis=1)
-    worst = np.where((worst == status.CONVERGED) & above.any(axis=1), status.ONE_STEP, worst)
+    """Return {row number: most severe code} of the runs that failed."""
+    worst = np.asarray(status.most_severe(codes, axis=1))
     return {int(sweep.numbers[k]): int(worst[k]) for k in np.flatnonzero(worst != status.CONVERGED)}
 
 

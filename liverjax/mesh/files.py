@@ -36,7 +36,8 @@ def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
     """Read a file with tetrahedra of 4 or 10 nodes, in any format of meshio, and its sets of nodes and elements.
 
     In meshes of 10-node elements the vertices get the first numbers, in the order of the file. The middles of the edges
-    follow. Curved edges are made straight, with a warning.
+    follow. Curved edges are made straight, with a warning. Nodes without a tetrahedron are left out, with a warning,
+    and the nodes after them get smaller numbers. Nodes are counted from 0, also if the file has other numbers (Abaqus).
 
     Args:
         path: mesh file.

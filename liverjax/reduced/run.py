@@ -193,7 +193,7 @@ def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Calla
         motion = None if motion is None else reduced_kinematics(e, found.q)
         fluid = None if flow is None else advanced_fluid(flow, flat)
         code = jnp.where(found.residual <= solve.tolerance, status.CONVERGED, status.STALLED)
-        code = jnp.where(jnp.min(determinant(F)) <= 0, status.INVERTED, code)
+        code = jnp.where((code == status.CONVERGED) & (jnp.min(determinant(F)) <= 0), status.INVERTED, code)
         code = jnp.where(jnp.all(jnp.isfinite(found.q)), code, status.NOT_FINITE)
         row = found.q, code, found.iterations, found.residual, None if fluid is None else fluid.pressure
         return (found.q, memory, fluid, motion, found.inverse), row

@@ -31,6 +31,7 @@ from liverjax.reduced.physics.fluid import (
 )
 from liverjax.reduced.physics.supports import reduced_springs
 from liverjax.reduced.run import prescribed_gradients
+from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.tensors.matrices import determinant
 from liverjax.tensors.principal_fields import principal_fields
@@ -124,9 +125,9 @@ def states_of(runs: int, steps: int) -> list[tuple[int, np.ndarray]]:
 
 def _reduced_compliance(whole: ReducedModel, scene: Scene) -> np.ndarray:
     """Return the reduced compliance (n, n) [m^4/N] of n modes: the inverse of the reduced stiffness at the reference
-    shape. The changes of the law in regions are not used."""
+    shape."""
     modes = np.asarray(whole.modes).reshape(whole.number_of_modes, -1)
-    K = mjed.stiffness_matrix(scene.mesh, law_at_rest(scene), scene.mesh.points)
+    K = mjed.stiffness_matrix(scene.mesh, law_at_rest(by_element(scene)), scene.mesh.points)
     springs = reduced_springs(whole.modes, scene)
     return np.linalg.inv(modes @ (K @ modes.T) + (0.0 if springs is None else np.asarray(springs)))
 

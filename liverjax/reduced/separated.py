@@ -174,7 +174,7 @@ def _displacements(scene: Scene, names: tuple[str, ...], rows: np.ndarray) -> np
     bad = np.flatnonzero(np.any(np.asarray(result.status) != status.CONVERGED, axis=1))
     if len(bad):
         at = ", ".join(f"{name} = {value:.4g}" for name, value in zip(names, rows[bad[0]], strict=True))
-        code = np.asarray(result.status)[bad[0]].max()
+        code = int(status.most_severe(result.status[bad[0]]))
         raise InputError(
             f"{len(bad)} of {len(rows)} runs failed, first at {at}: {status.advice(code)}; narrow the ranges"
         )

@@ -19,7 +19,7 @@ from liverjax.core.struct import param, replace, struct
 from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.scenes.scene_checks import check_before_run
 from liverjax.simulation import automatic, gradient_checkpoints
-from liverjax.simulation.equations import equations, initial_state, unknowns
+from liverjax.simulation.equations import equations, initial_state, outputs, unknowns
 from liverjax.simulation.run import Result, prepared, simulate
 from liverjax.simulation.step import beginning
 
@@ -101,6 +101,7 @@ _WORK = 440
 def memory(scene: Scene, store: str | int = "all") -> int:
     """Predict the memory [bytes] for a derivative in reverse mode, without compilation.
 
+    The arrays of the result and of the derivative with respect to its positions are included.
     For a loaded mesh, the memory for the search for its reference shape is not included.
 
     Raises:
@@ -115,18 +116,19 @@ def memory(scene: Scene, store: str | int = "all") -> int:
     def carry(scene):
         start = initial_state(scene)
         first = equations(scene, start, jnp.ones((), scene.mesh.points.dtype))
-        return start, beginning(first)[0], unknowns(first, start.x)
+        # For each step: positions, their derivatives, reactions, and the fluid pressure.
+        result = start.x, start.x, start.x, outputs(scene, start)
+        return start, beginning(first)[0], unknowns(first, start.x), result
 
-    state, tangent, root = (_bytes(part) for part in jax.eval_shape(carry, scene))
+    state, tangent, root, result = (_bytes(part) for part in jax.eval_shape(carry, scene))
     if scene.porosity is not None and scene.porosity.scheme == "implicit":
         root += scene.mesh.number_of_vertices * scene.mesh.points.dtype.itemsize
     # There are two tangents: the tangent of a step, and the tangent of the beginning of the run.
     work = 2 * tangent + _WORK * scene.mesh.weights.size * scene.mesh.points.dtype.itemsize
     if kept >= steps:
-        return steps * (state + root) + work
+        return steps * (state + root + result) + work
     count, length, rest = gradient_checkpoints.lengths(steps, kept)
-    # The term with 3/2 is the memory for the result of the run, whose arrays do not all exist at the same time.
-    return (count + (rest > 0)) * (state + tangent) + length * (state + root) + 3 * steps * root // 2 + work
+    return (count + (rest > 0)) * (state + tangent) + length * (state + root) + steps * result + work
 
 
 def _bytes(tree: Any) -> int:

@@ -42,6 +42,7 @@ class _Card(NamedTuple):
     parameters: dict[str, str]  # names in capital letters
     lines: list[list[str]]  # cells of the data lines
     inside: bool = True  # True: the card is in the part, or the file has no parts. False: it is in the assembly.
+    assembly: str = ""  # name of the assembly in small letters; "" if it has none, or the name of the part or instance
 
 
 class _Block(NamedTuple):
@@ -156,12 +157,15 @@ def _of_one_part(cards: list[_Card]) -> list[_Card]:
         return cards
     if len(parts) > 1 or len(_cards_of(cards, "INSTANCE")) > 1:
         raise _Wrong("the file has several parts or instances; export one part with one mesh")
+    names = {card.keyword: card.parameters.get("NAME", "").lower() for card in cards}
+    assembly = names.get("ASSEMBLY", "")
+    assembly = "" if assembly in (names["PART"], names.get("INSTANCE")) else assembly
     inside, depth = [], 0  # if the part is empty, its instance may contain the nodes and elements
     for card in cards:
         depth -= card.keyword in ("END PART", "END INSTANCE")
         inside.append(depth > 0)
         depth += card.keyword in ("PART", "INSTANCE")
-    marked = [card._replace(inside=own) for card, own in zip(cards, inside, strict=True)]
+    marked = [card._replace(inside=own, assembly=assembly) for card, own in zip(cards, inside, strict=True)]
     # NODE and ELEMENT cards outside the part lose their data lines. Their sets still exist, but are empty.
     kept = [card for card in marked if card.inside or card.keyword not in ("NODE", "ELEMENT")]
     return kept + [
@@ -233,15 +237,17 @@ def _cards_of_sets(cards: list[_Card], key: str) -> dict[_Place, list[int]]:
     return found
 
 
-def _place_of(name: str, inside: bool, places: Iterable[_Place], where: str, kind: str) -> _Place:
-    """Return the place of the set that a card names. `inside`: whether the card belongs to the part. `where`, `kind`:
-    keyword of the card, and the kind of the set (set of nodes or of elements), for messages."""
+def _place_of(name: str, card: _Card, places: Iterable[_Place], kind: str) -> _Place:
+    """Return the place of the set that a card names. `kind`: the kind of the set (set of nodes or of elements), for
+    messages."""
     small = name.lower()
-    last = small.rpartition(".")[2]  # the name of the part or of the assembly may stand before the name of the set
-    candidates = ((inside, small), (True, small), (True, last), (False, small), (False, last))
+    before, _, last = small.rpartition(".")  # the name of the part or of the assembly may stand before that of the set
+    candidates = [(card.inside, small), (True, small), (True, last), (False, small), (False, last)]
+    if before and before == card.assembly:
+        candidates.insert(0, (False, last))
     at = next((place for place in candidates if place in places), None)
     if at is None:
-        raise _Wrong(f"*{where} contains {name}, but the file does not define this {kind}; define it")
+        raise _Wrong(f"*{card.keyword} contains {name}, but the file does not define this {kind}; define it")
     return at
 
 
@@ -264,7 +270,7 @@ def _members(
             numbers, others = _listed(cards[k], of_elements) if cards[k].keyword == key else (by_card.get(k, ()), ())
             together.update(numbers)
             for other in others:
-                together |= members(_place_of(other, own[0], found, key, "set"), (*outer, own))
+                together |= members(_place_of(other, cards[k], found, "set"), (*outer, own))
         return together
 
     return {place: members(place, ()) for place in found}
@@ -313,7 +319,7 @@ def _surfaces(
             of, face = line[0], line[1].upper() if len(line) > 1 else ""
             if face in _FACES:
                 last = of.rpartition(".")[2]  # the name of the part may stand before the number
-                at = None if last.isdigit() else _place_of(of, card.inside, element_sets, "SURFACE", "set of elements")
+                at = None if last.isdigit() else _place_of(of, card, element_sets, "set of elements")
                 members = {int(last)} if at is None else element_sets[at]
                 own = [corners[k][list(_FACES[face])] for k in sorted(members & corners.keys())]
                 found.setdefault((card.inside, name.lower()), []).extend(own)
@@ -323,7 +329,7 @@ def _surfaces(
 def _listed(card: _Card, of_elements: dict[_Place, set[int]]) -> tuple[set[int], list[str]]:
     """Return the numbers, and the names of other sets (in small letters), that a card of a set contains."""
     if card.keyword == "NSET" and "ELSET" in card.parameters:
-        return of_elements[_place_of(card.parameters["ELSET"], card.inside, of_elements, "NSET", "set of elements")], []
+        return of_elements[_place_of(card.parameters["ELSET"], card, of_elements, "set of elements")], []
     numbers, others = set(), []
     # In the assembly, numbers without the name of an instance belong to reference points.
     of_part = card.inside or "INSTANCE" in card.parameters
