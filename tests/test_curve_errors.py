@@ -9,6 +9,7 @@ from test_curves import KNOWN, synthetic
 import liverjax as lj
 from fitting.fits import stress_stretch
 from fitting.fits.honesty.wrong_columns import structured_curves
+from fitting.methods.estimate import covering_root, spread
 from fitting.methods.noise.uneven_noise import growing_root, uneven_root
 from fitting.readers import curves
 from fitting.reports import curves_report
@@ -66,6 +67,42 @@ def test_errors_of_a_law_contain_uneven_noise():
         found = stress_stretch.fit(candidate, [curves.Curve("a", "uniaxial", F, (0, 0), noisy, 0)])
         z.append((found.values - [500.0, 10.0]) / found.standard_errors)
     assert np.sqrt(np.mean(np.square(z))) < 2.0, z
+
+
+def test_a_covariance_that_covers_two_others():
+    rng = np.random.default_rng(0)
+    for lost in (1.0, 1e140):
+        first, second = rng.standard_normal((3, 5)), rng.standard_normal((3, 8)) * np.array([[10.0], [1.0], [0.1]])
+        first[2] *= lost
+        own = covering_root(first, second)
+        for combination in rng.standard_normal((50, 3)) * [1.0, 1.0, 1 / lost]:
+            sizes = [np.linalg.norm(combination @ root) for root in (own, first, second)]
+            assert (1 - 1e-9) * max(sizes[1:]) < sizes[0] < 1.5 * np.hypot(*sizes[1:])
+    same = covering_root(second, 0.5 * second)
+    assert np.allclose(same @ same.T, second @ second.T, rtol=1e-9)
+    assert covering_root(0 * first, second) is second and covering_root(first[:0], second[:0]).shape[0] == 0
+
+
+def test_errors_of_the_stress_contain_the_scatter_of_samples():
+    """The correlation belonged to another kind of noise than the standard errors. The stress at the largest stretch had
+    two thirds of its error. The factors of the four samples scatter by 10 %, so the error of their mean is 5 %.
+    """
+    stretch = np.linspace(1.0, 1.5, 20)
+    J = np.tile(np.stack([2 * (stretch - stretch**-2), 2 * (1 - stretch**-3)], axis=1), (4, 1))  # of Mooney's law
+    exact, F = J[:20] @ np.array([300.0, 200.0]), np.broadcast_to(np.eye(3), (20, 3, 3))
+    errors = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        stresses = exact * (1 + 0.1 * rng.standard_normal((4, 1))) + 0.02 * exact.mean() * rng.standard_normal((4, 20))
+        size = float(np.sqrt(np.mean(exact**2)))
+        four = [curves.Curve(f"{k}", "uniaxial", F, (0, 0), P, law_scale=size) for k, P in enumerate(stresses)]
+        r = (J @ (np.linalg.pinv(J) @ stresses.ravel()) - stresses.ravel()) / size
+        noise = float(np.sqrt(r @ r / 78))
+        half, _ = spread(J / size, noise, np.eye(2))
+        own, correlation, *_ = stress_stretch._errors_of_law(four, (J / size, r, noise), np.eye(2), half, True)
+        root = J[19] * own
+        errors.append(np.sqrt(root @ correlation @ root) / exact[-1])
+    assert 0.05 < np.mean(errors) < 0.1, np.mean(errors)
 
 
 @pytest.mark.slow

@@ -158,7 +158,7 @@ def test_errors_at_two_limits_are_those_of_the_law_there():
         found[name] = stress_stretch.fit(candidate, data)
     assert found["exponential"].limits == {"c1": "infinity", "c2": "0"}
     assert found["exponential"].values[2] == pytest.approx(found["bogen"].values[1], rel=1e-4)
-    assert found["exponential"].standard_errors[2] == pytest.approx(found["bogen"].standard_errors[1], rel=1e-3)
+    assert found["exponential"].standard_errors[2] == pytest.approx(found["bogen"].standard_errors[1], rel=1e-2)
 
 
 def test_a_law_at_its_limit_says_so_without_warnings_of_numpy():

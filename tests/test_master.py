@@ -195,6 +195,10 @@ def test_a_file_with_a_column_of_temperature(tmp_path, unit, order):
     head, *rows = (tmp_path / "a.csv").read_text().splitlines()
     (tmp_path / "b.csv").write_text("\n".join([head, *(row for row in rows for _ in range(2))]) + "\n")
     again = temperature_sweeps.read_temperatures([tmp_path / "b.csv"])
+    assert all(any("copies of other points" in note for note in own.notes) for own in again.sweeps)
+    rows += [row.replace(",", ",1", 1) for row in rows]  # other moduli at the same frequencies
+    (tmp_path / "c.csv").write_text("\n".join([head, *rows]) + "\n")
+    again = temperature_sweeps.read_temperatures([tmp_path / "c.csv"])
     assert all(any("repeated" in note for note in own.notes) for own in again.sweeps)
     found = master_curve.master_curve(data, TEMPERATURES[REFERENCE] + 3)
     assert found.shifts.reference == REFERENCE and np.abs(found.shifts.log_a - TRUE).max() < 3e-3

@@ -14,7 +14,7 @@ from fitting.fits.families.hyperelastic import Candidate, ground_state_modulus
 from fitting.fits.families.hyperelastic import candidates as candidates  # users import it from this module
 from fitting.fits.honesty.other_minima import of_other_minima
 from fitting.fits.viscoelastic import EXACT
-from fitting.methods.estimate import LOST, errors_and_correlation, noise_factor, spread
+from fitting.methods.estimate import LOST, covering_root, errors_and_correlation, noise_factor, spread
 from fitting.methods.generalised_maxwell import HOPELESS
 from fitting.methods.least_squares import Solution, levenberg_marquardt
 from fitting.methods.noise.alike_noise import Alike, along_rows
@@ -66,9 +66,6 @@ _HIDDEN, _MOVED = 2.0, 0.05
 RUNAWAY, FREE = 1e6, 30.0
 #: The comparison with FREE assumes at least this relative noise, because no test is more accurate.
 _LEAST_NOISE = 1e-3
-#: Uneven noise differs in size between points. If the standard error for uneven noise exceeds the error for equal noise
-#: by this factor, the correlation for uneven noise is used.
-_UNEVEN = 1.2
 #: _REPEATS: number of repeated fits in which the law's stress gives the divisors of the residuals. No fit is repeated
 #: if the law's stress is below _LEAST_SIZE times the measured stress in a curve. If the stress of a curve differs by
 #: more than the factor _FOREIGN from that of other curves of the same test, it may be wrong, e.g. in another unit.
@@ -289,8 +286,8 @@ def _errors_of_law(
     of_tests: bool,
 ) -> tuple[np.ndarray, np.ndarray, Alike | None, FactorNoise | None]:
     """Return the standard errors and the correlation of the P parameters, the noise that is correlated between
-    neighbouring points, and the factors that multiply the stress of each test. Each standard error is the largest of
-    the standard errors for several kinds of noise.
+    neighbouring points, and the factors that multiply the stress of each test. The errors and the correlation belong to
+    one covariance that covers the covariances for several kinds of noise (`covering_root`).
 
     Args:
         curves: the fitted curves.
@@ -301,9 +298,8 @@ def _errors_of_law(
             with the stress.
     """
     J, misfit, noise = residuals
-    errors, correlation = errors_and_correlation(half)
-    if not np.all(np.isfinite(misfit)):
-        return errors, correlation, None, None
+    if not (np.all(np.isfinite(misfit)) and np.all(np.isfinite(half))):
+        return *errors_and_correlation(half), None, None
     fitted = np.concatenate([c.stress / c.divisor for c in curves]) + misfit
     roots = [uneven_root(J, misfit, slope)]
     if of_tests:
@@ -319,11 +315,8 @@ def _errors_of_law(
     if factors is not None:
         roots.append(factors.root)
     for root in roots:
-        uneven = errors_and_correlation(root)
-        if np.any(uneven[0] > _UNEVEN * errors):
-            correlation = uneven[1]
-        errors = np.maximum(errors, uneven[0])
-    return errors, correlation, alike, factors
+        half = covering_root(half, np.clip(np.where(np.isfinite(root), root, LOST), -LOST, LOST))
+    return *errors_and_correlation(half), alike, factors
 
 
 def _warnings(fit: LawFit, curves: list[Curve], singular: np.ndarray, held: bool) -> list[str]:

@@ -13,6 +13,9 @@ from fitting.methods.least_squares import Solution
 #: Value that replaces an infinite error in a covariance. The square of this value is still finite.
 LOST = 1e140
 
+#: In a square root of a covariance, singular values have at least this ratio to the largest one.
+_NO_SPREAD = 1e-10
+
 
 class Estimate(NamedTuple):
     """P parameters in the order of `names`, with standard errors and correlation. k is the number of independent
@@ -142,6 +145,25 @@ def errors_and_correlation(root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         covariance = root @ root.T
         errors = np.sqrt(np.diag(covariance))
         return errors, covariance / np.maximum(np.outer(errors, errors), 1e-300)
+
+
+def covering_root(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the square root (P, P) of a covariance that covers two covariances of P parameters. No combination of the
+    parameters has a smaller variance than in one of the two covariances.
+
+    Args:
+        first, second: square roots (P, k) of the two covariances; k may differ.
+    """
+    sizes = np.maximum(np.linalg.norm(first, axis=1), np.linalg.norm(second, axis=1))
+    sizes = np.where(sizes > 0, sizes, 1.0)[:, None]
+    U, s, _ = np.linalg.svd(first / sizes, full_matrices=False)
+    if not np.any(s):
+        return second
+    # In the coordinates with the axes U s, the first covariance is the unit matrix.
+    s = np.maximum(s, _NO_SPREAD * s.max())
+    M = (U / s).T @ (second / sizes)
+    squares, axes = np.linalg.eigh(M @ M.T)
+    return sizes * ((U * s) @ axes * np.sqrt(np.maximum(squares, 1.0)))
 
 
 def wider(estimate: Estimate, direction: np.ndarray) -> Estimate:

@@ -284,6 +284,19 @@ def some(sweep: Sweep, kept: np.ndarray) -> Sweep:
     return sweep._replace(**columns, raw=raw)
 
 
+def without_copies(sweep: Sweep) -> Sweep:
+    """Return the sweep without points that are copies of earlier points: all their numbers are the same. A copy is no
+    new measurement. A note reports the number of copies."""
+    columns = (sweep.angular_frequency, sweep.storage, sweep.loss, sweep.storage_sd, sweep.loss_sd)
+    every = [*(v for v in columns if v is not None), *(sweep.raw or {}).values()]
+    rows = np.nan_to_num(np.column_stack(every), nan=np.inf)  # an empty cell equals an empty cell
+    kept = np.isin(np.arange(len(rows)), np.unique(rows, axis=0, return_index=True)[1])
+    if kept.all():
+        return sweep
+    note = f"{(~kept).sum()} of {len(kept)} points are ignored, because they are copies of other points"
+    return some(sweep, kept)._replace(notes=(*sweep.notes, note))
+
+
 def with_friction(sweep: Sweep, error: float, radius: float, height: float) -> Sweep:
     """Return the sweep with its fields `friction` and `friction_error`. `error` [N m s] is the standard deviation of
     the friction of the instrument's bearing; `radius` and `height` of the sample are in m."""

@@ -6,6 +6,9 @@ import numpy as np
 #: beside it, _NOISES times the noise, and _OF_LARGEST times the largest value.
 _FAR, _NOISES, _OF_LARGEST = 10.0, 20.0, 0.02
 _LOW = 0.5
+#: Sizes are smoothed over _WINDOW values. A size is not smoothed if its distance from the smooth size exceeds two
+#: limits: the first number of _OFF_LINE times the size, and the second times the robust deviation of all distances.
+_WINDOW, _OFF_LINE = 11, (0.2, 5.0)
 #: Two values are the same if they differ by less than this fraction of the largest value.
 _SAME = 1e-9
 #: A series counts as rounded if at least this fraction of its neighbouring values are the same.
@@ -57,6 +60,24 @@ def sizes_of_series(values: np.ndarray) -> np.ndarray:
     sizes = np.abs(values)
     typical = median_filter(sizes, 3, mode="mirror")
     return np.where(sizes < _LOW * typical, typical, sizes)
+
+
+def smooth_sizes(values: np.ndarray) -> np.ndarray:
+    """Return `sizes_of_series`, smoothed by straight lines through `_WINDOW` neighbouring values (n,).
+
+    If a residual is divided by its own measured value, a value that is low by chance has more weight than a value that
+    is high. The fit is then too low by twice the square of the relative noise. A size that differs much from the line
+    (`_OFF_LINE`), for example beside a jump, is not smoothed.
+    """
+    from scipy.signal import savgol_filter
+
+    sizes = sizes_of_series(values)
+    if len(sizes) < _WINDOW:
+        return sizes
+    line = savgol_filter(sizes, _WINDOW, 1)
+    off = np.abs(line - sizes)
+    least = np.maximum(_OFF_LINE[0] * sizes, _OFF_LINE[1] * 1.4826 * np.median(off))
+    return np.where((off > least) | (line <= 0), sizes, line)
 
 
 def far_values(values: np.ndarray) -> np.ndarray:

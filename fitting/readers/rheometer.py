@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 # Some of these names are imported only for users: `fitting.rheometer` exports all names of this module.
-from fitting.readers.frequency_sweep import FEWEST, Sweep
+from fitting.readers.frequency_sweep import FEWEST, Sweep, without_copies
 from fitting.readers.frequency_sweep import some as some
 from fitting.readers.frequency_sweep import within as within
 from fitting.readers.frequency_sweep import without_inertia as without_inertia
@@ -35,7 +35,8 @@ def read_sweep(path: str | os.PathLike, table: str | None = None) -> Sweep:
     """Read a frequency sweep.
 
     A point is ignored if a modulus or the frequency is not finite, not positive, or outside of `SMALLEST` to
-    `LARGEST`. A note names these points.
+    `LARGEST`. A note names these points. A point is also ignored if it is a copy of another point: a line with the same
+    numbers in all columns that are used.
 
     Args:
         path: an instrument's export, or text with a header that names ``frequency_Hz`` or ``angular_frequency_rad_s``,
@@ -148,12 +149,13 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
     order = np.argsort(omega, kind="stable")
     if not np.array_equal(order, np.arange(len(omega))):
         notes.append(SORTED)
-    repeated = len(omega) - len(np.unique(omega))
-    if repeated:
-        notes.append(f"repeated frequencies: {repeated}. {REPEATED}")
     get: Content = {q: values[q][order] if q in values else None for q in ("storage", "loss", "storage_sd", "loss_sd")}
     raw = {q: v[good][order] for q, v in table.raw.items()}
-    return Sweep(omega[order], **get, source=path, notes=tuple(notes), raw=raw or None)
+    found = without_copies(Sweep(omega[order], **get, source=path, notes=tuple(notes), raw=raw or None))
+    repeated = len(found.storage) - len(np.unique(omega))
+    if repeated:
+        found = found._replace(notes=(*found.notes, f"repeated frequencies: {repeated}. {REPEATED}"))
+    return found
 
 
 #: Note on a file whose lines were not sorted by frequency.

@@ -11,7 +11,7 @@ from fitting.readers.noise_of_series import (
     noise_of_series,
     rounding_at_rest,
     rounding_of_series,
-    sizes_of_series,
+    smooth_sizes,
     told_of_far_values,
 )
 from fitting.readers.scattering_load import without_scatter
@@ -54,7 +54,7 @@ class TimeTest(NamedTuple):
 
     @property
     def scales(self) -> np.ndarray:
-        """Scales of the residuals: the size of each response, with a lower bound for responses below the noise.
+        """Scales of the residuals: smoothed sizes of the responses, with a lower bound for responses below the noise.
         If the noise is constant, all scales are the median of these sizes."""
         sizes = self._sizes_of_answers()
         return np.full(len(sizes), np.median(sizes)) if self.constant_noise else sizes
@@ -63,7 +63,7 @@ class TimeTest(NamedTuple):
         answer = self.answer[self.used]
         noise = max(noise_of_series(answer), rounding_of_series(answer), self.rounding)
         floor = max(noise / RELATIVE, (CYCLIC if self.cyclic else LEAST_SIZE) * float(np.max(np.abs(answer))))
-        return np.hypot(sizes_of_series(answer), floor)
+        return np.hypot(smooth_sizes(answer), floor)
 
     @property
     def cyclic(self) -> bool:

@@ -128,12 +128,12 @@ def _sizes(fit: TimeFit, r: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, bool
     """Return the standard deviations of the m residuals r (m,), and whether the noise has a constant size. Otherwise
     the standard deviation of the noise is proportional to the measured response. The residuals decide which case is
     more probable. J: derivatives (m, p) of the residuals with respect to the p unknowns."""
-    # The scales are computed from measured values, so they contain noise, which would disturb the comparison. So the
-    # fitted values replace the measured values here.
+    # The scales are computed from measured values, so they may contain noise, which would disturb the comparison. So
+    # the fitted values replace the measured values here. The lower bound of the scales is the same for all values.
     if np.ptp(fit.scales) == 0:  # the fit already assumes constant noise
         equal = np.ones(len(r))
         return probability_of_sizes(J, r, equal)[1] * equal, True
-    lower = fit.scales**2 - fit.measured**2
+    lower = max(0.0, float(np.median(fit.scales**2 - fit.measured**2)))
     relative = np.sqrt(np.maximum(fit.fitted**2 + lower, 1e-300)) / fit.scales
     constant = np.median(fit.scales) / fit.scales
     (one, level), (other, its_level) = (probability_of_sizes(J, r, size) for size in (relative, constant))
