@@ -116,19 +116,21 @@ def memory(scene: Scene, store: str | int = "all") -> int:
     def carry(scene):
         start = initial_state(scene)
         first = equations(scene, start, jnp.ones((), scene.mesh.points.dtype))
-        # For each step: positions, their derivatives, reactions, and the fluid pressure.
-        result = start.x, start.x, start.x, outputs(scene, start)
-        return start, beginning(first)[0], unknowns(first, start.x), result
+        return start, beginning(first)[0], unknowns(first, start.x), start.x, outputs(scene, start)
 
-    state, tangent, root, result = (_bytes(part) for part in jax.eval_shape(carry, scene))
+    state, tangent, root, positions, others = (_bytes(part) for part in jax.eval_shape(carry, scene))
     if scene.porosity is not None and scene.porosity.scheme == "implicit":
         root += scene.mesh.number_of_vertices * scene.mesh.points.dtype.itemsize
-    # There are two tangents: the tangent of a step, and the tangent of the beginning of the run.
-    work = 2 * tangent + _WORK * scene.mesh.weights.size * scene.mesh.points.dtype.itemsize
-    if kept >= steps:
-        return steps * (state + root + result) + work
-    count, length, rest = gradient_checkpoints.lengths(steps, kept)
-    return (count + (rest > 0)) * (state + tangent) + length * (state + root) + steps * result + work
+    stored, again = steps * (state + root), 0
+    if kept < steps:
+        count, length, rest = gradient_checkpoints.lengths(steps, kept)
+        stored, again = (count + (rest > 0)) * (state + tangent), length * (state + root)
+    # There are two tangents: the tangent of a step, and the tangent of the beginning of the run. The run holds three
+    # arrays like the positions for each step, and reactions or pressures. The way back holds only the derivatives with
+    # respect to the positions, and the work of one step.
+    forward = stored + steps * (3 * positions + others) + 2 * tangent
+    work = _WORK * scene.mesh.weights.size * scene.mesh.points.dtype.itemsize
+    return max(forward, stored + again + steps * positions + 2 * tangent + work)
 
 
 def _bytes(tree: Any) -> int:
