@@ -235,6 +235,15 @@ def test_a_drift_that_may_not_continue_is_not_continued(case):
         assert found.left < 0 and found.level_error > 0.5
 
 
+@pytest.mark.parametrize("end", [100.0, 200.0])
+def test_a_clear_drift_is_told_however_large_it_becomes(end):
+    """A drift that reaches 40 % of the largest response gave no note, although one of 20 % did."""
+    time = np.linspace(-1.1, 0, 12)
+    answer = 0.02 * time + 1e-4 * np.random.default_rng(1).standard_normal(12)
+    found = base_line(time, answer, 10.0, end)
+    assert found.slope == 0 and np.isclose(found.left, 0.02, rtol=0.02)
+
+
 def test_an_offset_needs_more_than_noise_of_similar_neighbours():
     """The noise was taken as independent. With a correlation of 0.8, offsets that did not exist were found in 32 %."""
     time = np.arange(-2.0, 0, 0.1)

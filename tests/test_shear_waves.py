@@ -11,6 +11,7 @@ from fitting.__main__ import main
 from fitting.commands import sweep as sweep_command
 from fitting.commands import together as together_command
 from fitting.fits import together
+from fitting.fits.honesty import common_factor
 from fitting.methods import generalised_maxwell
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.frequency_sweep import Sweep
@@ -189,6 +190,18 @@ def test_the_inertia_that_stays_in_the_sweeps_is_told_beside_waves(capsys):
     tests = [sweep(0.0), waves(0.0)]
     assert together_command.without_sample_inertia(tests, 1060.0, None) == tests
     assert "--density without --height subtracts no inertia" in capsys.readouterr().err
+
+
+def test_waves_have_no_error_of_a_sample_size():
+    """The waves had the error of a sample between plates. So sizes seemed to explain too large factors."""
+    w = waves(0.003)
+    stiffer = w._replace(velocity=np.sqrt(1.03) * w.velocity, attenuation=w.attenuation / np.sqrt(1.03))
+    fit = together.fit([sweep(0.003), stiffer], 2)
+    sizes = together_command.errors_of_sizes(SimpleNamespace(radius=None, height=None), fit.tests)
+    assert sizes[0] > 0.01 and sizes[1] == 0.0
+    (told,) = common_factor.told(fit, sizes)
+    assert "all moduli of waves.csv are 1.03" in told and "made at another temperature" in told
+    assert "errors in the sizes of the samples explain" in common_factor.told(fit, sizes[0])[0]
 
 
 def test_waves_are_cut_to_the_band_as_sweeps_are():

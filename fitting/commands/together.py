@@ -18,9 +18,6 @@ if TYPE_CHECKING:
 def run(options: argparse.Namespace) -> int:
     """Fit all tests in closed form. The exit code is 1 if the fit did not converge."""
     from fitting.fits.families import springpots_in_time
-    from fitting.fits.honesty import total_error
-    from fitting.fits.simulated_rheometer import Simulation
-    from fitting.readers.time_tests import TimeTest
     from fitting.reports import together_report
     from liverjax.core.files import writable
 
@@ -31,10 +28,7 @@ def run(options: argparse.Namespace) -> int:
         for note in test.notes:
             print(f"note: {Path(test.source).name}: {note}", file=sys.stderr)
     writable(options.out, ("fit.json", "fit.png"))
-    default = Simulation()
-    rig = Simulation(radius=options.radius or default.radius, height=options.height or default.height)
-    axial = [isinstance(test, TimeTest) and test.axial for test in tests]
-    relative = np.array([total_error.of_geometry(rig, None, each) for each in axial])
+    relative = errors_of_sizes(options, tests)
     with named_bar(f"{len(tests)} tests") as told:
         found = springpots_in_time.choose_together(tests, options.model, options.modes, told, relative)
     together_report.write(options.out, found, relative, options.density)
@@ -45,6 +39,24 @@ def run(options: argparse.Namespace) -> int:
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"written: {options.out}/fit.json, fit.png")
     return 0 if found.converged else 1
+
+
+def errors_of_sizes(options: argparse.Namespace, tests: "list[Measured]") -> np.ndarray:
+    """Return the relative errors (K,) of the moduli of the K tests due to the sizes of their samples. The error is 0
+    for shear waves, because their moduli do not depend on the size of the sample."""
+    from fitting.fits.honesty import total_error
+    from fitting.fits.simulated_rheometer import Simulation
+    from fitting.readers.time_tests import TimeTest
+    from fitting.waves.dispersion import Dispersion
+
+    default = Simulation()
+    rig = Simulation(radius=options.radius or default.radius, height=options.height or default.height)
+
+    def error_of(test: "Measured") -> float:
+        axial = isinstance(test, TimeTest) and test.axial
+        return 0.0 if isinstance(test, Dispersion) else total_error.of_geometry(rig, None, axial)
+
+    return np.array(list(map(error_of, tests)))
 
 
 def without_sample_inertia(tests: "list[Measured]", density: float | None, height: float | None) -> "list[Measured]":

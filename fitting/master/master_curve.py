@@ -121,22 +121,25 @@ def _sentences(found: Shifts, noise: float) -> list[str]:
 
 def _factors_of_moduli(sweeps: list[Sweep], found: Shifts) -> list[str]:
     """Return a note if the sweeps lie much nearer to one curve when their moduli are multiplied by factors too
-    (F-test)."""
+    (F-test). The distances in G' and in G'' have the weights of the fit with factors, so that the noise of one modulus
+    does not hide a change of the other one."""
     try:
         other = shifts.found(sweeps, found.temperatures, found.reference, vertical=True)
         chance = _chance_of_factors(sweeps, found, other)
     except InputError:
         return []
-    if found.apart < SMOOTH or not other.apart < BETTER * found.apart or chance > CHANCE:
+    without, with_factors = (shifts.weighted_distance(sweeps, own, other.weights) for own in (found, other))
+    if without < SMOOTH or not with_factors < BETTER * without or chance > CHANCE:
         return []
     b, T = 10.0**other.log_b, celsius(found.temperatures)
     moved = np.abs(other.log_a - found.log_a) / np.maximum(found.log_a_errors, 1e-12)
     k = int(np.argmax(moved))
+    weighted = " (G' and G'' weighted by their noise)" if other.weights != (1.0, 1.0) else ""
     return [
         f"the moduli also change with the temperature by factors of {b.min():.3g} to {b.max():.3g}. With --vertical, "
-        f"the sweeps lie {100 * other.apart:.2g} % from one curve instead of {100 * found.apart:.2g} %, and log10 a at "
-        f"{T[k]:.4g} °C is {other.log_a[k]:.3g} instead of {found.log_a[k]:.3g} ± {found.log_a_errors[k]:.1g}. The "
-        "stated error does not contain this difference: give --vertical"
+        f"the sweeps lie {100 * with_factors:.2g} % from one curve instead of {100 * without:.2g} %{weighted}, and "
+        f"log10 a at {T[k]:.4g} °C is {other.log_a[k]:.3g} instead of {found.log_a[k]:.3g} ± "
+        f"{found.log_a_errors[k]:.1g}. The stated error does not contain this difference: give --vertical"
     ]
 
 
@@ -156,7 +159,9 @@ def _chance_of_factors(sweeps: list[Sweep], alone: Shifts, both: Shifts) -> floa
     at = both.temperatures, both.reference
     alone, both = (shifts.found(sweeps, *at, vertical, (knots,)) for vertical in (False, True))
     more, data = len(sweeps) - 1, sum(2 * len(s.storage) for s in sweeps)
-    ratio = shifts.sum_of_squares(alone) / max(shifts.sum_of_squares(both), np.finfo(float).tiny)
+    # The ratio of two sums with different weights would not follow the F-distribution.
+    without, with_factors = (shifts.weighted_distance(sweeps, own, both.weights) ** 2 for own in (alone, both))
+    ratio = without / max(with_factors, np.finfo(float).tiny)
     freedom = data - 2 * more - 2 * shifts.size_of_curve(sweeps, both.log_a, knots)
     return 1.0 if freedom < 1 else float(scipy.special.fdtrc(more, freedom, max(0.0, ratio - 1) * freedom / more))
 
@@ -170,11 +175,12 @@ def _unshown_factors(sweeps: list[Sweep], found: Shifts) -> list[str]:
     G = [np.log10(np.concatenate([getattr(s, name) for s in sweeps])) for name in ("storage", "loss")]
     # A power law has the same slope in log G' and log G'', and the temperature moves both by the same distance.
     A = np.block([[of_sweep, x, np.zeros_like(x)], [of_sweep, x, np.ones_like(x)]])
-    y = np.concatenate(G)
-    straight = np.sum((A @ np.linalg.lstsq(A, y, rcond=None)[0] - y) ** 2) * np.log(10) ** 2
+    y, weights = np.concatenate(G), np.repeat(found.weights, sum(counts))
+    c = np.linalg.lstsq(weights[:, None] * A, weights * y, rcond=None)[0]
+    straight = np.average((A @ c - y) ** 2, weights=weights**2) * np.log(10) ** 2
     numbers = 2 * (len(sweeps) - 1) + 2 * shifts.size_of_curve(sweeps, found.log_a, found.knots)
     more, freedom = numbers - A.shape[1], len(y) - numbers
-    ratio = straight / max(shifts.sum_of_squares(found), np.finfo(float).tiny)
+    ratio = straight / max(shifts.weighted_distance(sweeps, found, found.weights) ** 2, np.finfo(float).tiny)
     if freedom < 1 or more < 1 or scipy.special.fdtrc(more, freedom, max(0.0, ratio - 1) * freedom / more) < CHANCE:
         return []
     return [

@@ -113,11 +113,6 @@ def _points_of(sweeps: Sequence[Sweep]) -> np.ndarray:
     return np.array([len(s.storage) for s in sweeps])
 
 
-def sum_of_squares(shifts: Shifts) -> float:
-    """Return the sum of the squares of the relative distances of all G' and G'' from the curve."""
-    return float(2 * shifts.points @ shifts.misfit**2)
-
-
 def _best(sweeps: Sequence[Sweep], every: list[Shifts], factors: int) -> Shifts:
     """Return the result with the lowest corrected information criterion. If the data are too few to compute this
     criterion for any result, return the result with the largest distance between knots. `factors`: number of fitted
@@ -130,7 +125,7 @@ def _best(sweeps: Sequence[Sweep], every: list[Shifts], factors: int) -> Shifts:
         numbers = 2 * size_of_curve(sweeps, own.log_a, own.knots) + factors + 1 + differ
         if data < numbers + 2:
             return np.inf
-        squares = _squares_of_moduli(sweeps, own) if differ else np.array([sum_of_squares(own) / data])
+        squares = _squares_of_moduli(sweeps, own) if differ else np.array([own.apart**2])
         fit = data * float(np.mean(np.log(np.maximum(squares, least))))
         return fit + 2 * numbers * (1 + (numbers + 1) / (data - numbers - 1))
 
@@ -141,6 +136,12 @@ def _squares_of_moduli(sweeps: Sequence[Sweep], own: Shifts) -> np.ndarray:
     """Return the mean squared relative distances (2,) of G' and of G'' from their curves."""
     distances = _distances_of_moduli(sweeps, own.log_a, own.log_b, own.knots)
     return np.mean(distances**2, axis=1) * np.log(10) ** 2
+
+
+def weighted_distance(sweeps: Sequence[Sweep], own: Shifts, weights: tuple[float, float]) -> float:
+    """Return the relative root mean square distance of all points from the curve. `weights` multiply the distances in
+    log G' and in log G''. With equal weights, the result is `Shifts.apart`."""
+    return float(np.sqrt(np.average(_squares_of_moduli(sweeps, own), weights=np.square(weights))))
 
 
 def _at_knots(

@@ -111,17 +111,19 @@ def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, flo
     if np.any(missing):
         # A hyphen after a letter or a digit separates words ("Sweep-25C"), so it is not a minus sign.
         stated = re.search(r"((?:(?<![^\W_])-)?\d+(?:[.,]\d+)?)\s*°?\s*([CK])\b", name)
-        if stated is None and not np.all(missing):
-            raise InputError(
-                f"{path}: the temperature of {missing.sum()} of {len(T)} rows is missing; fill in these cells, or "
-                "remove these rows"
-            )
-        if stated is None:
+        if stated is None and np.all(missing):
             raise InputError(
                 f"{path}: the table {repr(name) if name else 'of the file'} states no temperature; add a column "
                 "temperature_C"
             )
-        T = np.full(len(sweep.storage), float(stated[1].replace(",", ".")) + 273.15 * (stated[2] == "C"))
+        of_name = float(stated[1].replace(",", ".")) + 273.15 * (stated[2] == "C") if stated else np.nan
+        # A name with one temperature does not tell the missing temperatures of a table with others.
+        if not np.all(np.abs(T[~missing] - of_name) < SAME):
+            raise InputError(
+                f"{path}: the temperature of {missing.sum()} of {len(T)} rows is missing; fill in these cells, or "
+                "remove these rows"
+            )
+        T = np.full(len(T), of_name)
     if np.any(T <= 0):
         raise InputError(f"{path}: a temperature of {celsius(T.min()):.4g} °C is below absolute zero; check the unit")
     # If each temperature occurs in as many rows as a sweep needs, the column contains set temperatures.

@@ -56,13 +56,13 @@ def base_line(time: np.ndarray, answer: np.ndarray, size: float, end: float, rou
         _straight_line(time[half:], answer[half:]),
     )
     steady = abs(first - second) < 3 * np.hypot(e1, e2)
-    small = abs(slope) * end < _LARGE * size
-    if steady and small and rest > _LONG * end and abs(slope) > _CLEAR * slope_error:
+    small, clear = abs(slope) * end < _LARGE * size, abs(slope) > _CLEAR * slope_error
+    if steady and small and rest > _LONG * end and clear:
         return BaseLine(level, max(level_error, rounding), slope, max(slope_error, _CONTINUED * abs(slope)))
     error = max(error, 0.5 * abs(slope) * rest)
     if steady and small:  # the whole drift is an error
         return BaseLine(mean, error, slope_error=abs(slope), left=slope)
-    return BaseLine(mean, error, left=slope) if error > OFFSET * size else flat
+    return BaseLine(mean, error, left=slope) if clear or error > OFFSET * size else flat
 
 
 def _mean_at_rest(answer: np.ndarray) -> tuple[float, float]:
