@@ -180,7 +180,10 @@ def test_the_structure_of_velocities_and_attenuations_is_tested_separately():
     """Residuals of the attenuation that change sign in every row hid a structured misfit of the velocity."""
     own = waves(0.0)
     signs = np.concatenate([np.repeat([1.0, -1.0], 6), np.tile([1.0, -1.0], 6)])
-    fit = SimpleNamespace(tests=[own], fitted=[own.measured * (1 + 0.01 * signs)])
+    solution = SimpleNamespace(residuals=signs, jacobian=np.zeros((len(signs), 1)))
+    share = SimpleNamespace(points=len(signs), noise=0.01)
+    fitted = [own.measured * (1 + 0.01 * signs)]
+    fit = SimpleNamespace(tests=[own], fitted=fitted, solution=solution, shares=[share])
     (told,) = together.structured(fit)
     assert "waves.csv (velocity): the residuals change sign only 1 times in 12 values" in told
 

@@ -28,7 +28,6 @@ from fitting.fits.time_tests import INDEPENDENT, TimeFit
 from fitting.fits.viscoelastic import FLUID, Fit, Kind
 from fitting.methods import generalised_maxwell, springpots
 from fitting.methods.generalised_maxwell import Maxwell
-from fitting.methods.noise.uneven_noise import sizes_shown
 from fitting.methods.sampling import tempering
 from fitting.methods.sampling.diagnostics import r_hat
 from fitting.methods.sampling.tempering import Chains, Density
@@ -346,7 +345,7 @@ def _with_gap(found: Posterior, fit: Fit, seed: int) -> Posterior:
 
 def of_sweep(fit: Fit, sweep: Sweep, count: int, seed: int = 0) -> Posterior:
     """Sample the posterior of a closed-form fit of Prony modes or of a fractional model."""
-    sweep = _with_noise_shown(fit, sweep)
+    sweep = alike_points.with_weights_shown(fit, sweep)
     data = (sweep.angular_frequency, sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
     if fit.kind.values is None:
         function = viscoelastic.residuals_of(fit.kind)
@@ -360,19 +359,6 @@ def of_sweep(fit: Fit, sweep: Sweep, count: int, seed: int = 0) -> Posterior:
 
     own = _sweep_target(fit.kind, sweep, residuals)
     return _with_gap(sample(own, len(fit.solution.u), count, seed), fit, seed)
-
-
-def _with_noise_shown(fit: Fit, sweep: Sweep) -> Sweep:
-    """Return the sweep with weights for the noise of G' and G'' that the residuals show. The sweep is unchanged if all
-    values have the same relative noise, or if standard deviations are given. It is also unchanged if neighbouring
-    residuals are correlated, because they may then be a misfit of the model."""
-    J, r = np.asarray(fit.solution.jacobian), np.asarray(fit.solution.residuals)
-    unknown = fit.noise_root is None or alike_points.INDEPENDENT in fit.details
-    sizes = None if unknown else sizes_shown(J, r, np.concatenate(sweep.deviations))
-    if sizes is None:
-        return sweep
-    first, second = (d * s for d, s in zip(sweep.deviations, np.split(sizes, 2), strict=True))
-    return sweep._replace(storage_sd=first, loss_sd=second, sd_estimated=True)
 
 
 def _beside_instrument(fit: Fit, sweep: Sweep, residuals: Callable[[np.ndarray], np.ndarray]) -> tuple[Target, int]:
@@ -409,7 +395,7 @@ def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, se
     draws are simulated in full. `Posterior.simulated` contains the largest difference between the simulated and the
     approximate log likelihood of these draws. This difference shows how good the approximation is.
     """
-    sweep = _with_noise_shown(fit, sweep)
+    sweep = alike_points.with_weights_shown(fit, sweep)
     data, scales = simulated_rheometer.simulation_data(sweep, simulation), np.concatenate(sweep.deviations)
     rig, law, omega, _, measured, _ = data
 

@@ -18,6 +18,7 @@ from fitting.methods import generalised_maxwell, host, kramers_kronig, time_resp
 from fitting.methods.estimate import Estimate, errors_and_correlation, spread
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.least_squares import Solution, degrees_of_freedom, from_starts
+from fitting.methods.noise.uneven_noise import weighted_by_sizes
 from fitting.readers.frequency_sweep import Sweep, check_sweep
 from fitting.readers.time_tests import TimeTest
 from fitting.waves import shear_waves
@@ -437,17 +438,34 @@ def missed(shares: list[Share]) -> list[str]:
     ]
 
 
+def series_of(test: Measured) -> tuple[str, ...]:
+    """Return the names of the series of measured values of a test, in parentheses. The series have equal lengths. The
+    name is empty if there is only one series."""
+    if isinstance(test, Sweep):
+        return (" (G')", " (G'')")
+    waves = isinstance(test, Dispersion) and test.attenuation is not None
+    return (" (velocity)", " (attenuation)") if waves else ("",)
+
+
+def _fitted_by_noise(fit: Together) -> list[np.ndarray]:
+    """Return the predictions of each test. If the two series of a test have noise of different size, the predictions
+    are those of a fit with weights for this noise (`weighted_by_sizes`)."""
+    J, r = np.asarray(fit.solution.jacobian), np.asarray(fit.solution.residuals)
+    ends, groups = np.cumsum([s.points for s in fit.shares]), []
+    for test, end, share in zip(fit.tests, ends, fit.shares, strict=True):
+        if len(series_of(test)) == 2 and least_noise(test) < 1.0:
+            groups.append(np.full(len(r), -1))
+            groups[-1][end - share.points : end] = np.arange(share.points) >= share.points // 2
+    moved = np.split((weighted_by_sizes(J, r, np.ones(len(r)), groups) - r)[: ends[-1]], ends[:-1])
+    rows = zip(fit.tests, fit.fitted, moved, fit.shares, strict=True)
+    return [fitted + own * share.noise * reported_numbers(test)[2] for test, fitted, own, share in rows]
+
+
 def structured(fit: Together) -> list[str]:
-    """Return a warning for each series of residuals that changes sign too rarely. A sweep has two series, G' and G''.
-    Shear waves have two if the attenuation was measured."""
+    """Return a warning for each series of residuals (`series_of`) that changes sign too rarely."""
     out = []
-    for test, fitted in zip(fit.tests, fit.fitted, strict=True):
-        residuals = fitted - reported_numbers(test)[1]
-        names = [""]
-        if isinstance(test, Sweep):
-            names = [" (G')", " (G'')"]
-        elif isinstance(test, Dispersion) and test.attenuation is not None:
-            names = [" (velocity)", " (attenuation)"]
+    for test, fitted in zip(fit.tests, _fitted_by_noise(fit), strict=True):
+        residuals, names = fitted - reported_numbers(test)[1], series_of(test)
         if np.max(np.abs(residuals) / sizes_of(test)) <= viscoelastic.EXACT:
             continue
         for part, what in zip(np.split(residuals, len(names)), names, strict=True):

@@ -253,6 +253,13 @@ def root_of_noise_shown(found: Solution, sweep: Sweep) -> np.ndarray | None:
     return None if sizes is None else root_of_sizes(J, sizes, np.eye(J.shape[1]))
 
 
+def sizes_of_noise(fit: Fit, sweep: Sweep) -> np.ndarray | None:
+    """Return the standard deviations (2n,) of the residuals of G' and G'' at n frequencies, if the residuals show that
+    these differ (`sizes_shown`). Returns None if all may be equal, or if standard deviations are given."""
+    J, r = np.asarray(fit.solution.jacobian), np.asarray(fit.solution.residuals)
+    return None if fit.noise_root is None else sizes_shown(J, r, np.concatenate(sweep.deviations))
+
+
 def _of_repeats(J: np.ndarray, r: np.ndarray, omega: np.ndarray) -> np.ndarray | None:
     """Return the square root of the covariance of the unknowns for noise that is correlated between repeated values of
     G', or of G'', at one frequency. Returns None if the residuals show no such noise."""

@@ -38,7 +38,7 @@ class Consistency(NamedTuple):
     """Results of the checks of a sweep."""
 
     misfit: float  # relative root mean square distance of the best non-negative spectrum from the data
-    scatter: float  # relative scatter of neighbouring points about a smooth curve
+    scatter: float  # relative scatter of neighbouring points about a smooth curve (root mean square)
     breaches: tuple[tuple[float, float, str], ...]  # intervals [rad/s] and the violated bound
     onset: float | None  # last frequency [rad/s] before the instrument's inertia shows; None: no effect of this inertia
 
@@ -48,17 +48,22 @@ class Consistency(NamedTuple):
         return self.misfit > max(FAR, FAR_RATIO * self.scatter)
 
 
-def of_data(sweep: Sweep, dense: Spectrum) -> Consistency:
-    """Check whether a sweep violates the bounds, and how far the best spectrum `dense` is from the data. `dense` is the
-    result of `generalised_maxwell.spectrum`."""
-    omega, storage, loss = merged(sweep.angular_frequency, sweep.storage, sweep.loss)
-    noises = scatter(omega, storage), scatter(omega, loss)
+def of_data(sweep: Sweep, dense: Spectrum, sizes: np.ndarray | None = None) -> Consistency:
+    """Check whether a sweep violates the bounds, and how far the best spectrum `dense` is from the data.
+
+    Args:
+        sweep: data with n frequencies.
+        dense: the result of `generalised_maxwell.spectrum`.
+        sizes: relative noise (2n,) of G' then G''. Only its dependence on the frequency is used, because the size is
+            estimated from the scatter of the points. None: the relative noise is the same at all frequencies.
+    """
+    omega, noises = np.unique(sweep.angular_frequency), _relative_noises(sweep, sizes)
     breaches = []
-    for k, why in enumerate(_breaches(sweep)):
+    for k, why in enumerate(_breaches(sweep, sizes)):
         if why:
             breaches.append((float(omega[k]), float(omega[k + 1]), why))
-    late = onset_of(sweep)
-    return Consistency(dense.misfit, max(noises), tuple(breaches), None if late is None else late[0])
+    late, scattered = onset_of(sweep, sizes), max(float(np.sqrt(np.mean(noise**2))) for noise in noises)
+    return Consistency(dense.misfit, scattered, tuple(breaches), None if late is None else late[0])
 
 
 def without_instrument(sweep: Sweep) -> Sweep:
@@ -91,46 +96,52 @@ def without_instrument(sweep: Sweep) -> Sweep:
     return here._replace(grey=grey, notes=(*sweep.notes, note))
 
 
-def onset_of(sweep: Sweep) -> tuple[float, str] | None:
+def onset_of(sweep: Sweep, sizes: np.ndarray | None = None) -> tuple[float, str] | None:
     """Find the effect of the instrument's inertia (the mark of the instrument) in the last half decade of the sweep.
-    Returns the last frequency [rad/s] before the mark and the violated bound, or None if there is no mark."""
+    Returns the last frequency [rad/s] before the mark and the violated bound, or None if there is no mark. `sizes`: see
+    `of_data`."""
     omega = np.unique(sweep.angular_frequency)
-    for low, why in zip(omega[:-1], _breaches(sweep), strict=True):
+    for low, why in zip(omega[:-1], _breaches(sweep, sizes), strict=True):
         if low > omega[-1] / math.sqrt(10) and why.startswith("G' "):
             return float(low), why
     return None
 
 
-def _noise_of_loss(sweep: Sweep, same: float) -> np.ndarray:
-    """Return the relative noise of G'' at every frequency.
+def _relative_noises(sweep: Sweep, sizes: np.ndarray | None) -> list[np.ndarray]:
+    """Return the relative noise of G' and of G'' at every frequency, from the scatter of the points. `sizes`: see
+    `of_data`."""
+    omega, *moduli = merged(sweep.angular_frequency, sweep.storage, sweep.loss)
+    sizes = np.ones(2 * len(sweep.storage)) if sizes is None else sizes
+    _, *shapes = merged(sweep.angular_frequency, *np.split(sizes, 2))
+    return [scatter(omega, m) * shape / np.median(shape) for m, shape in zip(moduli, shapes, strict=True)]
 
-    `same` is the relative noise of G'' if it is the same at all frequencies. If the sweep has standard deviations that
-    were estimated from its scatter (`sd_estimated`), the larger of `same` and `loss_sd` / G'' is returned.
+
+def _breaches(sweep: Sweep, sizes: np.ndarray | None) -> list[str]:
+    """Return for each pair of neighbouring frequencies the result of `_breach`.
+
+    If the sweep has standard deviations that were estimated from its scatter (`sd_estimated`), the noise of G'' is at
+    least `loss_sd`. `sizes`: see `of_data`.
     """
-    if sweep.sd_estimated and sweep.loss_sd is not None:
-        return np.maximum(same, sweep.loss_sd / sweep.loss)
-    return np.full(len(np.unique(sweep.angular_frequency)), same)
-
-
-def _breaches(sweep: Sweep) -> list[str]:
-    """Return for each pair of neighbouring frequencies the result of `_breach`."""
     omega, storage, loss = merged(sweep.angular_frequency, sweep.storage, sweep.loss)
     limit = SIGNIFICANT * (1 + _FEW_POINTS / len(omega) ** 2)
-    of_storage, of_loss = limit * scatter(omega, storage), limit * _noise_of_loss(sweep, scatter(omega, loss))
+    of_storage, of_loss = _relative_noises(sweep, sizes)
+    if sweep.sd_estimated and sweep.loss_sd is not None:
+        of_loss = np.maximum(of_loss, merged(sweep.angular_frequency, sweep.loss_sd / sweep.loss)[1])
+    limits = limit * np.stack([of_storage, of_loss])
     pairs = [slice(k, k + 2) for k in range(len(omega) - 1)]
-    return [_breach(omega[own], storage[own], loss[own], (of_storage, of_loss[own])) for own in pairs]
+    return [_breach(omega[own], storage[own], loss[own], limits[:, own]) for own in pairs]
 
 
-def _breach(omega: np.ndarray, storage: np.ndarray, loss: np.ndarray, limits: tuple[float, np.ndarray]) -> str:
+def _breach(omega: np.ndarray, storage: np.ndarray, loss: np.ndarray, limits: np.ndarray) -> str:
     """Return words that say how two neighbouring points violate a bound, or an empty string.
 
-    `limits`: largest relative errors of G' (the same at both points) and of G'' that are regarded as scatter.
+    `limits`: largest relative errors (2, 2) of G' and of G'' (rows) at the two points that are regarded as scatter.
     """
     step = math.log(omega[1] / omega[0])
     # Upper bound of the rise of G' between the two points, for the largest G'' that is possible between them:
     # |d ln G''/d ln omega| is at most 1.
     most = step * max(loss) * math.exp(step / 2)
-    rise, margin = storage[1] - storage[0], max(limits[0] * math.hypot(*storage), NEGLIGIBLE * max(storage))
+    rise, margin = storage[1] - storage[0], max(math.hypot(*limits[0] * storage), NEGLIGIBLE * max(storage))
     if rise > most + margin:
         return "G' rises by more than G'' allows"
     if -rise > margin:

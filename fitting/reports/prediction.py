@@ -8,7 +8,7 @@ import numpy as np
 import scipy.stats
 
 from fitting.fits import time_tests
-from fitting.fits.together import Measured, name_of, reported_numbers, sizes_of
+from fitting.fits.together import Measured, name_of, reported_numbers, series_of, sizes_of
 from fitting.fits.viscoelastic import Fit
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.frequency_sweep import Sweep
@@ -31,7 +31,7 @@ class Prediction(NamedTuple):
     scales: np.ndarray  # (m,) residuals are weighted by 1 / scales: standard deviations if the test has them
     sizes: np.ndarray  # (m,) relative error = |predicted - measured| / sizes; infinite if a value does not count
     inside: np.ndarray  # (m,) whether the point is in the band of the fitted sweep
-    noise: float  # noise of the measured values, divided by `scales`; NaN if the values are too few to estimate it
+    noise: np.ndarray  # (m,) noise of the measured values, divided by `scales`; NaN: too few values to estimate it
 
     @property
     def relative_errors(self) -> np.ndarray:
@@ -49,9 +49,9 @@ class Prediction(NamedTuple):
     def covered(self) -> float:
         """Fraction of the measured values in the band that lie within the 95 % interval of the prediction. The width of
         this interval includes the scatter of the measured values. NaN if this scatter is unknown."""
-        if np.isnan(self.noise):
+        if np.isnan(self.noise).any():
             return np.nan
-        off, own = (self.predicted - self.measured)[self.inside], self.noise * self.scales[self.inside]
+        off, own = (v[self.inside] for v in (self.predicted - self.measured, self.noise * self.scales))
         return float(
             np.mean(np.abs(off) < scipy.stats.norm.ppf(0.975) * np.hypot(self.standard_errors[self.inside], own))
         )
@@ -87,14 +87,16 @@ def predict(fit: Fit, resolved: tuple[float, float], test: Measured) -> Predicti
     sizes = sizes_of(test)
     if isinstance(test, TimeTest):
         sizes = time_tests.sizes_of_prediction(measured, predicted, sizes, test.rounding)
-    noise = _scatter_around((predicted - measured) / scales, inside, test)
+    off, parts = (predicted - measured) / scales, len(series_of(test))
+    rows = zip(np.split(off, parts), np.split(inside, parts), strict=True)
+    noise = np.repeat([_scatter_around(*row, test) for row in rows], len(off) // parts)
     return Prediction(name_of(test), test.source, predicted, measured, errors, scales, sizes, inside, noise)
 
 
 def _scatter_around(off: np.ndarray, inside: np.ndarray, test: Measured) -> float:
-    """Return the noise of a test, divided by its scales. It is estimated from the differences `off` (m,) between
-    prediction and test. Those outside the band are used only if fewer than four are `inside` (m,). NaN for fewer than
-    four values without deviations."""
+    """Return the noise of one series of a test (`series_of`), divided by its scales. It is estimated from the k
+    differences `off` (k,) between prediction and test. Those outside the band are used only if fewer than four are
+    `inside` (k,). NaN for fewer than four values without deviations."""
     off = off[inside] if inside.sum() >= 4 else off
     if isinstance(test, Sweep) and test.noise_given:
         return max(1.0, noise_of_series(off))

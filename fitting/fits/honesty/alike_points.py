@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from fitting.fits.viscoelastic import EXACT, Fit
+from fitting.fits.viscoelastic import EXACT, Fit, sizes_of_noise
 from fitting.methods import host, uncertainty
 from fitting.methods.estimate import Estimate, errors_and_correlation, wider
 from fitting.methods.noise.alike_noise import LOST, Alike, along_rows
@@ -64,6 +64,17 @@ def alike_of(fit: Fit) -> Alike | None:
     size = np.where(size > 0, size, 1.0)
     inverse = np.linalg.pinv(J / size, rcond=LOST) / size[:, None]
     return along_rows([n, n], r, J, fit.uncertainty.noise, inverse)
+
+
+def with_weights_shown(fit: Fit, sweep: Sweep) -> Sweep:
+    """Return the sweep with weights for the noise of G' and G'' that the residuals show. The sweep is unchanged if all
+    values have the same relative noise, or if standard deviations are given. It is also unchanged if neighbouring
+    residuals are correlated, because they may then be a misfit of the model."""
+    sizes = None if INDEPENDENT in fit.details else sizes_of_noise(fit, sweep)
+    if sizes is None:
+        return sweep
+    first, second = (d * s for d, s in zip(sweep.deviations, np.split(sizes, 2), strict=True))
+    return sweep._replace(storage_sd=first, loss_sd=second, sd_estimated=True)
 
 
 def not_below(estimate: Estimate, natural_of: Callable, u: np.ndarray, root: np.ndarray) -> Estimate:

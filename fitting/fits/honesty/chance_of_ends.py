@@ -87,6 +87,8 @@ def _noise_of_residuals(fit: Fit, sweep: Sweep, J: np.ndarray) -> np.ndarray:
         return sizes
     columns = ((sweep.storage, slice(0, n)), (sweep.loss, slice(n, 2 * n)))
     for (modulus, rows), deviation in zip(columns, sweep.deviations, strict=True):
-        seen = frequency_sweep.scatter(sweep.angular_frequency, modulus) * modulus / deviation
-        sizes[rows] = np.where(seen < SMOOTH * sizes[rows], seen, sizes[rows])
+        # Noise of one size in Pa has no single relative size, so the typical relative size is compared.
+        typical = np.median(sizes[rows] * deviation / modulus)
+        seen = frequency_sweep.scatter(sweep.angular_frequency, modulus)
+        sizes[rows] *= seen / typical if seen < SMOOTH * typical else 1.0
     return sizes

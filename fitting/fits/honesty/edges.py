@@ -6,7 +6,14 @@ import numpy as np
 
 from fitting.fits import viscoelastic
 from fitting.fits.honesty import chance_of_ends
-from fitting.fits.honesty.alike_points import CONTAINED, INDEPENDENT, OF_INDEPENDENT, SHARED, with_alike_points
+from fitting.fits.honesty.alike_points import (
+    CONTAINED,
+    INDEPENDENT,
+    OF_INDEPENDENT,
+    SHARED,
+    with_alike_points,
+    with_weights_shown,
+)
 from fitting.fits.honesty.long_times import with_interval
 from fitting.fits.time_tests import TimeFit
 from fitting.fits.viscoelastic import FLUID, MISSES, Fit
@@ -14,6 +21,7 @@ from fitting.methods import generalised_maxwell, host, kramers_kronig, relaxatio
 from fitting.methods.estimate import without_part
 from fitting.methods.generalised_maxwell import Spectrum
 from fitting.methods.least_squares import from_starts
+from fitting.methods.noise.uneven_noise import weighted_by_sizes
 from fitting.methods.uncertainty import equilibrium_change, equilibrium_error
 from fitting.readers.rheometer import Sweep, some
 
@@ -33,7 +41,8 @@ def honest(fit: Fit, sweep: Sweep, dense: Spectrum) -> Fit:
         own = {name: error for name, (_, error) in values(fit).items()}
         fit = wider._replace(details=wider.details | {OF_INDEPENDENT: own})
     details, warnings = dict(fit.details), list(fit.warnings)
-    found = kramers_kronig.of_data(sweep, dense)
+    sizes = viscoelastic.sizes_of_noise(fit, sweep)
+    found = kramers_kronig.of_data(sweep, dense, sizes)
     told = kramers_kronig.sentences(found, sweep)
     details["consistency"] = {
         "kramers_kronig_misfit": found.misfit,
@@ -42,9 +51,7 @@ def honest(fit: Fit, sweep: Sweep, dense: Spectrum) -> Fit:
         "instrument_above_Hz": None if found.onset is None else found.onset / (2 * np.pi),
     }
     if np.max(fit.relative_errors(sweep)) > viscoelastic.EXACT:
-        runs, structured = kramers_kronig.structure(
-            sweep.angular_frequency, fit.storage - sweep.storage, fit.loss - sweep.loss
-        )
+        runs, structured = kramers_kronig.structure(sweep.angular_frequency, *_left_over(fit, sweep, sizes))
         details["residuals"] = runs
         told += structured
         if structured and INDEPENDENT in details:  # do not report the same fact twice
@@ -77,7 +84,21 @@ def _with_long_times(fit: Fit, sweep: Sweep) -> Fit:
     u, common = fit.uncertainty, 0.0
     if u.shared is not None:
         common = float(np.linalg.norm(equilibrium_change(u.values, u.shared)))
-    return with_interval(fit, [sweep], [u.noise], factor, common) if factor > 0 else fit
+    shown = with_weights_shown(fit, sweep)
+    noise = u.noise if shown is sweep else 1.0
+    return with_interval(fit, [shown], [noise], factor, common) if factor > 0 else fit
+
+
+def _left_over(fit: Fit, sweep: Sweep, sizes: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the residuals (n,) [Pa] of G' and of G'' at n frequencies. If the residuals show noise of different size
+    (`viscoelastic.sizes_of_noise`), the residuals of a fit with weights for this noise are returned
+    (`weighted_by_sizes`)."""
+    if sizes is None:
+        return fit.storage - sweep.storage, fit.loss - sweep.loss
+    J, r = np.asarray(fit.solution.jacobian), np.asarray(fit.solution.residuals)
+    halves = (np.arange(len(r)) >= len(r) // 2).astype(int)
+    storage, loss = np.split(np.concatenate(sweep.deviations) * weighted_by_sizes(J, r, sizes, [halves]), 2)
+    return storage, loss
 
 
 def _nearest(fit: Fit, sweep: Sweep, misfit: float) -> str:

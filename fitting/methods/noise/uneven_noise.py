@@ -1,11 +1,15 @@
 """Standard errors of least squares that remain valid if the noise differs between points, for example if the noise
 grows with the stress."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import scipy.special
 
 #: For noise proportional to a size: lower bound of the noise, divided by the largest noise.
 _LEAST = 1e-6
+#: Maximum number of repeated fits with weights from the noise of two groups of residuals.
+_ROUNDS = 6
 #: Lower bound of 1 - leverage, the part of the noise of a point that stays in its residual.
 _LEFT = 0.05
 
@@ -72,6 +76,32 @@ def root_of_sizes(J: np.ndarray, sizes: np.ndarray, slope: np.ndarray) -> np.nda
     return slope @ (np.linalg.pinv(J / scale) / scale[:, None] * sizes)
 
 
+def weighted_by_sizes(J: np.ndarray, r: np.ndarray, sizes: np.ndarray, groups: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the residuals (n,) of a second fit, in which each residual is divided by its standard deviation
+    (first-order estimate).
+
+    In the first fit, the values with large noise move the model, so that all residuals of the values with small noise
+    may have the same sign. These residuals are also larger than their noise. So the sizes of the groups are estimated
+    again from the second fit, up to `_ROUNDS` times.
+
+    Args:
+        J, r: see `uneven_root`. They belong to the first fit, with equal weights.
+        sizes: first estimate of the standard deviations (n,).
+        groups: for each pair of groups of residuals, the argument `group` of `grouped_sizes`.
+    """
+    if not _well_conditioned(J):
+        return r
+    columns, left = J / np.linalg.norm(J, axis=0), r
+    for _ in range(_ROUNDS):
+        if np.any(sizes != 1):
+            left = r - columns @ (np.linalg.pinv(columns / sizes[:, None]) @ (r / sizes))
+        found = [grouped_sizes(columns / sizes[:, None], left / sizes, group) for group in groups]
+        if all(own is None for own in found):
+            break
+        sizes = sizes * np.prod([own for own in found if own is not None], axis=0)
+    return left
+
+
 def sizes_shown(J: np.ndarray, r: np.ndarray, scales: np.ndarray) -> np.ndarray | None:
     """Return the standard deviations (2m,) of the residuals of m values of G' and of m values of G'', if the residuals
     show that these differ. Returns None if they may be equal.
@@ -85,7 +115,7 @@ def sizes_shown(J: np.ndarray, r: np.ndarray, scales: np.ndarray) -> np.ndarray 
     """
     if not _well_conditioned(J) or len(r) <= J.shape[1] + 1:
         return None
-    grouped = grouped_sizes(J, r, np.arange(len(r)) >= len(r) // 2)
+    grouped = grouped_sizes(J, r, (np.arange(len(r)) >= len(r) // 2).astype(int))
     if _are_smooth(r):  # a misfit of the model, not noise
         return grouped
     constant = np.median(scales) / scales
@@ -96,20 +126,20 @@ def sizes_shown(J: np.ndarray, r: np.ndarray, scales: np.ndarray) -> np.ndarray 
     return grouped
 
 
-def grouped_sizes(J: np.ndarray, r: np.ndarray, second: np.ndarray) -> np.ndarray | None:
+def grouped_sizes(J: np.ndarray, r: np.ndarray, group: np.ndarray) -> np.ndarray | None:
     """Return the standard deviation of each residual (n,) if two groups of residuals (for example of G' and G'') have
     noise of different size. Returns None if the difference may be random, or if the data hardly determine some
     combination of the unknowns.
 
     Args:
         J, r: see `uneven_root`.
-        second: whether each residual (n,) belongs to the second group.
+        group: group of each residual (n,), 0 or 1. Other residuals have the number -1, and their result is 1.
     """
     if not _well_conditioned(J):
         return None
     scale = np.linalg.norm(J, axis=0)
     leverage = np.einsum("kn,nk->n", np.linalg.pinv(J / scale), J / scale)
-    freedom, square = (np.array([v[~second].sum(), v[second].sum()]) for v in (1 - leverage, r**2))
+    freedom, square = (np.array([v[group == k].sum() for k in (0, 1)]) for v in (1 - leverage, r**2))
     if not (np.all(freedom > 1) and np.all(square > 0)):
         return None
     variance = square / freedom
@@ -117,7 +147,7 @@ def grouped_sizes(J: np.ndarray, r: np.ndarray, second: np.ndarray) -> np.ndarra
     chance = scipy.special.fdtrc(freedom[large], freedom[small], variance[large] / variance[small])
     if large == small or 2 * chance > _CHANCE:
         return None
-    return np.sqrt(variance)[second.astype(int)]
+    return np.where(group < 0, 1.0, np.sqrt(variance)[group])
 
 
 def _are_smooth(r: np.ndarray) -> bool:
