@@ -120,6 +120,40 @@ def test_a_clamp_of_two_entries_is_a_clamp_of_one(order, richer):
         assert np.array_equal(free, own) and np.allclose(by, own_by, atol=1e-16)
 
 
+@pytest.mark.parametrize("richer", [enriched, lambda scene: on_refined_mesh(scene)[0]])
+@pytest.mark.parametrize(("axis", "height"), [(0, 0.0), (2, 0.1)], ids=["rows", "layers"])
+def test_a_clamp_of_single_rows_or_layers_is_a_clamp_of_one(axis, height, richer):
+    """No triangle had all its nodes in one row of a side, so the new nodes were free. Between layers of nodes, new
+    nodes inside the body were free too.
+    """
+    mesh = lj.shapes.box((0.1, 0.1, 0.1), (3, 3, 3))
+    x = np.asarray(mesh.points)
+    clamp = np.flatnonzero(x[:, 2] < height + 0.001)
+    rows = [clamp[np.abs(x[clamp, axis] - v) < 0.001] for v in np.linspace(0.0, 0.1, 4)]
+    law = lj.laws.NeoHookean(mu=770.0, bulk=2200.0)
+
+    def moved(nodes: np.ndarray) -> lj.Displaced:
+        return lj.Displaced(nodes=jnp.asarray(nodes), by=jnp.asarray(0.1 * x[nodes]))
+
+    for one in (lambda nodes: {"fixed": (lj.Fixed(nodes=nodes),)}, lambda nodes: {"displaced": (moved(nodes),)}):
+        several = [one(nodes) for nodes in rows]
+        joined = {key: sum((entry[key] for entry in several), ()) for key in several[0]}
+        both = (_motions(richer(lj.Scene(mesh=mesh, law=law, **entries))) for entries in (one(clamp), joined))
+        (free, by), (own, own_by) = both
+        assert np.array_equal(free, own) and np.allclose(by, own_by, atol=1e-16)
+
+
+def test_two_clamps_that_meet_at_an_edge_leave_the_other_sides_free():
+    mesh = lj.shapes.box((0.1, 0.1, 0.1), (3, 3, 3))
+    x = np.asarray(mesh.points)
+    rows = [np.flatnonzero((x[:, 2] < 0.001) & (np.abs(x[:, 1] - v) < 0.001)) for v in np.linspace(0.0, 0.1, 4)]
+    side = np.flatnonzero((x[:, 0] < 0.001) & (x[:, 2] > 0.001))
+    fixed = tuple(lj.Fixed(nodes=nodes) for nodes in (*rows, side))
+    rich = enriched(lj.Scene(mesh=mesh, law=lj.laws.NeoHookean(mu=770.0, bulk=2200.0), fixed=fixed))
+    y, (free, _) = np.asarray(rich.mesh.points), _motions(rich)
+    assert np.array_equal(~free.any(axis=1), (y[:, 0] < 0.001) | (y[:, 2] < 0.001))
+
+
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("richer", [enriched, lambda scene: on_refined_mesh(scene)[0]])
 def test_a_clamp_of_two_entries_has_known_nodes_inside_jit(order, richer):

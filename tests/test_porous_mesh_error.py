@@ -12,8 +12,9 @@ from liverjax.mesh.refinement import places_in, quarters, refined
 from liverjax.mesh.selection import boundary_triangles
 from liverjax.mesh.surface import areas
 from liverjax.physics.attached import vessel
+from liverjax.physics.darcy import unknown_pressures
 from liverjax.physics.elastic_support import ElasticSupport
-from liverjax.physics.porosity import Inlet
+from liverjax.physics.porosity import Inlet, inflow
 from liverjax.scenes.refined import can_be_refined, on_refined_mesh
 from liverjax.simulation.cautions import mesh_sentence
 from liverjax.simulation.equations import forces_at
@@ -217,6 +218,39 @@ def test_places_that_meet_at_an_edge_keep_their_size(order):
     y = np.asarray(fine.mesh.points)
     assert set(np.asarray(fine.fixed[0].nodes)) == set(place(y))
     assert set(np.asarray(fine.fixed[1].nodes)) == set(np.flatnonzero(np.abs(y[:, 1] - 0.5) < 1e-9))  # inside
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_pressures_between_drained_nodes_and_inlets_are_known(order):
+    """A top that is drained up to its last row of nodes, where an inlet gives the pressure: the pressures of the new
+    nodes between them were unknown.
+    """
+    mesh = lj.shapes.box((0.1, 0.1, 0.1), (2, 2, 2))
+    mesh = lj.quadratic(mesh) if order == 2 else mesh
+    x = np.asarray(mesh.points)
+    top = np.flatnonzero(x[:, 2] > 0.099)
+    drained, row = top[x[top, 0] < 0.06], top[x[top, 0] > 0.09]
+    clock = {"times": jnp.array([0.0, 1.0]), "history": jnp.array([0.0, 1.0])}
+    at_row = Inlet(nodes=row, pressure=4.0, **clock)
+    sponge = lj.Porosity(bulk=1.0, limit_bulk=9.0, fluid_fraction=0.5, permeability=1e-3, drained=drained)
+    law = lj.laws.NeoHookean(mu=1.0, bulk=2.0)
+
+    def pressures(**own):
+        scene = lj.Scene(mesh=mesh, law=law, porosity=replace(sponge, **own))
+        fine = on_refined_mesh(scene)[0]
+        assert can_be_refined(fine)
+        known = unknown_pressures(fine.porosity, fine.mesh, jnp.float64) == 0
+        y = np.asarray(fine.mesh.points)[: fine.mesh.number_of_vertices]
+        return y, np.asarray(known), np.asarray(inflow(fine.porosity, fine.mesh, 0.5, 1.0)[0])
+
+    y, known, given = pressures(inlet=(at_row,))
+    assert np.array_equal(known, y[:, 2] > 0.099) and known.sum() == 25
+    assert np.allclose(given, np.where(known, np.clip((y[:, 0] - 0.05) / 0.05, 0.0, 1.0) * 2.0, 0.0))
+    # Two inlets: the pressure between them is known if they have one history.
+    rest = Inlet(nodes=drained, pressure=2.0, **clock)
+    y, known, given = pressures(drained=None, inlet=(rest, at_row))
+    assert known.sum() == 25 and np.allclose(given[known & (np.abs(y[:, 0] - 0.075) < 0.01)], 1.5)
+    assert pressures(drained=None, inlet=(rest, replace(at_row, history=jnp.ones(2))))[1].sum() == 20
 
 
 def test_free_midside_nodes_stay_free_on_the_refined_mesh():

@@ -8,6 +8,7 @@ import pytest
 import liverjax as lj
 from liverjax.core.struct import replace
 from liverjax.physics.porosity import Inlet
+from liverjax.scenes.checks.numbers import check_bounds
 from liverjax.scenes.checks.regions import check_region_porosity
 from liverjax.scenes.scene_file import scene_from
 
@@ -156,3 +157,20 @@ def test_scenes_without_porosity_refuse_it():
     several = lj.Region(elements=jnp.array([0]), porosity={"permeability": jnp.array([1e-9, 1e-9])})
     with pytest.raises(lj.InputError, match="has 2 numbers; give one"):
         lj.simulate(column(region=(several,)))
+
+
+def test_overlapping_regions_are_checked_together():
+    """Each region was checked alone: a limit_bulk below bulk passed, and valid values of two regions were refused."""
+    mesh = column().mesh
+
+    def check(bulk, limit):
+        regions = (*everywhere(mesh, {"bulk": bulk}), lj.Region(elements=upper(mesh), porosity={"limit_bulk": limit}))
+        check_bounds(column(sponge=LIVER | {"bulk": 300.0, "limit_bulk": 1e4}, region=regions))
+
+    check(5000.0, 6000.0)
+    with pytest.raises(lj.InputError, match=r"region\.0, region\.1: .*= 1000 must be above bulk = 5000"):
+        check(5000.0, 1000.0)
+    with pytest.raises(lj.InputError, match="= 10000 must be above bulk = 20000"):  # outside the second region
+        check(2e4, 1e6)
+    both = (*everywhere(mesh, {"bulk": 2e4}), *everywhere(mesh, {"limit_bulk": 1e6}))
+    check_bounds(column(region=both))

@@ -75,41 +75,67 @@ def middles_of_places(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
     inside[nodes[nodes < V]] = True
     if inside.all():
         return V + np.arange(mesh.pattern.edges.shape[1])
-    tets = np.asarray(mesh.tetrahedra).astype(np.int64)
-    held = inside[tets]
-    own = np.concatenate([tets[held[:, face].all(axis=1)][:, face] for face in map(list, FACES)])
-    if not len(own):
-        return np.zeros(0, np.int64)
     surface = boundary_triangles(mesh).astype(np.int64)
     outer = surface[inside[surface].all(axis=1)]
-    code, of_outer = (face_codes(np.sort(t, axis=1), V) for t in (own, outer))
-    inner = own[~np.isin(code, of_outer)]
-    deep = np.ones(V, bool)
-    deep[surface.ravel()] = False
-    beside = _and_neighbours(mesh, deep & inside)
-    thin = ~_and_neighbours(mesh, _and_neighbours(mesh, deep))
-    inner = inner[(deep | beside)[inner].any(axis=1) | thin[inner].all(axis=1)]
+    inner = np.concatenate(_inner_faces(mesh, surface, inside))
+    if not len(outer) and not len(inner):
+        return np.zeros(0, np.int64)
     if not isinstance(mesh.points, jax.core.Tracer):
         outer = outer[_in_a_place(mesh, surface, inside)]
     return V + np.unique(np.concatenate([_edges_of(mesh, outer).ravel(), _edges_of(mesh, inner).ravel()]))
 
 
-def middles_between(mesh: TetMesh, groups: list[np.ndarray]) -> np.ndarray:
-    """Return the node numbers (V + edge number) of the edge middles on surface triangles between groups of vertices.
+def _inner_faces(mesh: TetMesh, surface: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the faces (m, 3) inside the body that belong to a region (see `middles_of_places`).
 
-    Such a triangle has all its vertices in the groups, but not in one group. It continues a region of one group
-    (`middles_of_places`): it is nearly parallel to a neighbour in this region, or to a neighbour that continues it.
+    The first array contains the faces near a vertex below the surface, and the second one the faces where the body is
+    only one element thick. A face may be in both arrays, and occurs once for each of its elements.
+    """
+    V, tets = mesh.number_of_vertices, np.asarray(mesh.tetrahedra).astype(np.int64)
+    held = inside[tets]
+    own = np.concatenate([tets[held[:, face].all(axis=1)][:, face] for face in map(list, FACES)])
+    code, of_surface = (face_codes(np.sort(t, axis=1), V) for t in (own, surface))
+    inner = own[~np.isin(code, of_surface)]
+    deep = np.ones(V, bool)
+    deep[surface.ravel()] = False
+    beside = _and_neighbours(mesh, deep & inside)
+    thin = ~_and_neighbours(mesh, _and_neighbours(mesh, deep))
+    return inner[(deep | beside)[inner].any(axis=1)], inner[thin[inner].all(axis=1)]
+
+
+def middles_between(mesh: TetMesh, groups: list[np.ndarray]) -> np.ndarray:
+    """Return the node numbers (V + edge number) of the edge middles on faces between groups of vertices.
+
+    Such a face has all its vertices in the groups, but not in one group. On the surface, it continues a region of one
+    group (`middles_of_places`): it is nearly parallel to a neighbour in this region, or to a neighbour that continues
+    it. Inside the body, one of its vertices is below the surface, or has an edge to a vertex of a group below the
+    surface. All groups without a surface triangle, for example single rows of nodes, count as one group, and its own
+    edge middles are in the result.
     """
     V = mesh.number_of_vertices
     inside = np.zeros((len(groups), V), bool)
     for own, nodes in zip(inside, groups, strict=True):
         own[nodes[nodes < V]] = True
     surface = boundary_triangles(mesh).astype(np.int64)
+    small = np.array([not own[surface].all(axis=1).any() for own in inside])
+    if small.any():
+        inside = np.concatenate([inside[~small], inside[small].any(axis=0, keepdims=True)])
+    middles = middles_of_places(mesh, np.flatnonzero(inside[-1])) if small.any() else np.zeros(0, np.int64)
+    of_any = np.asarray(inside.any(axis=0))
+    inner, _ = _inner_faces(mesh, surface, of_any)
+    inner = inner[~np.any([own[inner].all(axis=1) for own in inside], axis=0)]
+    outer = surface[_continued(mesh, surface, inside)]
+    return np.union1d(middles, V + np.concatenate([_edges_of(mesh, outer).ravel(), _edges_of(mesh, inner).ravel()]))
+
+
+def _continued(mesh: TetMesh, surface: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """Return a mask (m,) of the surface triangles between groups with the vertices `inside` (n, V), see
+    `middles_between`."""
     of_one = np.array([own[surface].all(axis=1) for own in inside])
     of_any = np.asarray(inside.any(axis=0))
     between = of_any[surface].all(axis=1) & ~of_one.any(axis=0)
     if not between.any():
-        return np.zeros(0, np.int64)
+        return np.asarray(between)
     for own, found in zip(inside, of_one, strict=True):
         found[found] = _in_a_place(mesh, surface, own)
     a, b = _pairs_at_edges(_edges_of(mesh, surface))
@@ -121,7 +147,7 @@ def middles_between(mesh: TetMesh, groups: list[np.ndarray]) -> np.ndarray:
         more[a[region[b]]] = True
         more &= between & ~region
         if not more.any():
-            return V + np.unique(_edges_of(mesh, surface[region & between]))
+            return np.asarray(region & between)
         region |= more
 
 

@@ -1,7 +1,8 @@
 """Supports and motions of the new nodes between two entries, for example between two `[[fixed]]` entries of one clamp.
 
 Each entry of a scene gets the new nodes between its own nodes. On a strip of triangles between two entries, the run
-prescribes the motion of all nodes. So the new nodes on this strip move as these triangles do in the run.
+prescribes the motion of all nodes. So the new nodes on this strip move as these triangles do in the run. Between two
+entries with given pressures of the fluid, the new nodes get the pressures of the run.
 """
 
 from collections.abc import Callable
@@ -12,7 +13,9 @@ import numpy as np
 
 from liverjax.core.struct import replace
 from liverjax.mesh.adjacency import node_numbers
+from liverjax.mesh.promotion import middles_between
 from liverjax.mesh.selection import AXES
+from liverjax.physics.porosity import Inlet, Porosity
 from liverjax.physics.prescribed import Displaced, Fixed
 from liverjax.scenes.scene import Scene
 
@@ -66,6 +69,44 @@ def joined_entries(
                 displaced = (*displaced, _along_axis(first, axis, nodes, by.astype(old.mesh.points.dtype)))
     fixed = (Fixed(nodes=node_numbers(nodes), axes=axes) for nodes, axes in still.items())
     return replace(made, fixed=(*made.fixed, *fixed), displaced=displaced)
+
+
+def joined_inlets(old: Scene, made: Porosity) -> tuple[Inlet, ...]:
+    """Return the inlets of `made`, and inlets for the new vertices between drained nodes and inlets of `old`.
+
+    `made` is the porosity on the refined mesh. A new vertex has the mean pressure of the ends of its edge. Between two
+    inlets with different histories, its pressure is unknown. If the positions of the mesh are unknown (inside jit, grad
+    or vmap), no inlet is added.
+    """
+    mesh, V = old.mesh, old.mesh.number_of_vertices
+    given, taken = ([] if s is None else _given_pressures(s) for s in (old.porosity, made))
+    if isinstance(mesh.points, jax.core.Tracer) or len(given) < 2:
+        return made.inlet
+    new = middles_between(mesh, [nodes for _, nodes in given])
+    new = np.setdiff1d(new, np.concatenate([nodes for _, nodes in taken]))
+    owner = np.full(V, -1)
+    for k, (_, nodes) in enumerate(given):  # where two inlets have a common node, the later one counts
+        owner[nodes[nodes < V]] = k
+    ends = np.sort(owner[np.asarray(mesh.pattern.edges)[:, new - V]], axis=0)
+    more = []
+    for k, m in np.unique(ends, axis=1).T:
+        own = node_numbers(new[(ends[0] == k) & (ends[1] == m)])
+        first, last = given[k][0], given[m][0]  # only `first` may be the drained nodes, because they have number 0
+        if last is None:
+            more.append(Inlet(nodes=own, pressure=0.0))
+        elif first is None:
+            more.append(replace(last, nodes=own, pressure=0.5 * last.pressure))
+        elif _same(first.times, last.times) and _same(first.history, last.history):
+            more.append(replace(last, nodes=own, pressure=0.5 * (first.pressure + last.pressure)))
+    return (*made.inlet, *more)
+
+
+def _given_pressures(porosity: Porosity) -> list[tuple[Inlet | None, np.ndarray]]:
+    """Return the inlets with a given pressure, and their nodes. Drained nodes come first, with None as their inlet."""
+    given: list[tuple[Inlet | None, np.ndarray]] = []
+    if porosity.drained is not None:
+        given.append((None, np.asarray(porosity.drained)))
+    return given + [(own, np.asarray(own.nodes)) for own in porosity.inlet if own.nodes is not None]
 
 
 def _entries_along(scene: Scene, axis: str) -> list[Fixed | Displaced]:

@@ -27,7 +27,7 @@ from liverjax.physics.base import Physics
 from liverjax.physics.porosity import Porosity
 from liverjax.physics.prescribed import Displaced
 from liverjax.physics.viscosity import Prony
-from liverjax.scenes.between_entries import joined_entries
+from liverjax.scenes.between_entries import joined_entries, joined_inlets
 from liverjax.scenes.regions import POROUS, VISCOUS
 from liverjax.scenes.scene import Scene
 from liverjax.tensors.subsets import subsets
@@ -113,7 +113,7 @@ def on_refined_mesh(scene: Scene) -> tuple[Scene, Within]:
         law=_law_of_parts(E, scene.law),
         viscosity=_series(scene.viscosity),
         region=tuple(replace(r, elements=node_numbers(parts_of(r.elements))) for r in scene.region),
-        porosity=_sponge(E, scene.porosity, more_pressures, parts),
+        porosity=_sponge(scene, more_pressures, parts),
         body=body,
         fixed=tuple(replace(f, nodes=more(f.nodes)) for f in scene.fixed),
         displaced=tuple(_moved_in_between(within, d, more(d.nodes), old.number_of_nodes) for d in scene.displaced),
@@ -199,14 +199,16 @@ def _series(prony: Prony | None) -> Prony | None:
     return replace(prony, **parts)
 
 
-def _sponge(E: int, porosity: Porosity | None, more: Callable[[Indices], Indices], parts: Callable) -> Porosity | None:
+def _sponge(scene: Scene, more: Callable[[Indices], Indices], parts: Callable) -> Porosity | None:
     """Return the porosity for the refined mesh, with new drained nodes, inlets, and values per element."""
+    porosity = scene.porosity
     if porosity is None:
         return None
     inlets = tuple(parts(own if own.nodes is None else replace(own, nodes=more(own.nodes))) for own in porosity.inlet)
     drained = None if porosity.drained is None else more(porosity.drained)
-    numbers = _of_parts(E, {name: getattr(porosity, name) for name in POROUS})
-    return replace(porosity, drained=drained, inlet=inlets, **numbers)
+    numbers = _of_parts(scene.mesh.number_of_elements, {name: getattr(porosity, name) for name in POROUS})
+    made = replace(porosity, drained=drained, inlet=inlets, **numbers)
+    return replace(made, inlet=joined_inlets(scene, made))
 
 
 def _moved_in_between(within: Within, moved: Displaced, nodes: Indices, number_of_nodes: int) -> Displaced:

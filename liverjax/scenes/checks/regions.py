@@ -4,12 +4,12 @@ import jax
 import numpy as np
 
 from liverjax import laws
-from liverjax.core import names
+from liverjax.core import bounds, names
 from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content, replace
 from liverjax.laws import Law
-from liverjax.physics.porosity import Porosity, check_sponge
+from liverjax.physics.porosity import Porosity, check_limit
 from liverjax.physics.viscosity import Prony, check_series
 from liverjax.scenes.regions import (
     POROUS,
@@ -28,13 +28,15 @@ def check_region_numbers(scene: Scene) -> None:
 
     Raises:
         InputError: a region changes [viscosity] or [porosity], but the scene has none; a name is unknown; a value is
-            out of bounds; a direction is incomplete or unusable; or the number of modes is wrong.
+            out of bounds; a direction is incomplete or unusable; the number of modes is wrong; or limit_bulk is not
+            above bulk in an element.
     """
     for k, region in enumerate(scene.region):
         _check_law(scene.law, region, f"region.{k}")
         check_region_viscosity(scene.viscosity, region, f"region.{k}")
         check_region_porosity(scene.porosity, region, f"region.{k}")
     _check_directions(scene)
+    _check_limits(scene)
 
 
 def check_region_elements(scene: Scene) -> None:
@@ -145,6 +147,8 @@ def check_region_viscosity(prony: Prony | None, region: Region, name: str) -> No
 def check_region_porosity(porosity: Porosity | None, region: Region, name: str) -> None:
     """Check the porous parameters of a region. Parameters inside jit, grad or vmap are not checked.
 
+    bulk and limit_bulk are not compared here, because several regions may change them in an element.
+
     Raises:
         InputError: the scene has no [porosity], a name is unknown, or a value is out of bounds.
     """
@@ -162,9 +166,37 @@ def check_region_porosity(porosity: Porosity | None, region: Region, name: str) 
     if any(isinstance(value, jax.core.Tracer) for value in numbers):
         return
     try:
-        check_sponge(replace(porosity, **own))
+        bounds.check_fields(replace(porosity, **own), "porosity")
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
+
+
+def _check_limits(scene: Scene) -> None:
+    """Raise InputError if limit_bulk is not above bulk in an element, with the changes by all regions.
+
+    Parameters inside jit, grad or vmap, and wrong element numbers, are not checked here.
+    """
+    porosity, n, keys = scene.porosity, scene.mesh.number_of_elements, ("bulk", "limit_bulk")
+    changed = {k: own for k, region in enumerate(scene.region) if (own := region.porosity) and set(keys) & set(own)}
+    if porosity is None or not changed:
+        return
+    values: Content = {key: getattr(porosity, key) for key in keys}
+    places = {k: scene.region[k].elements for k in changed}
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((values, changed, places))):
+        return
+    for key in keys:
+        numbers = np.broadcast_to(np.asarray(values[key], float), (n,)).copy()
+        for k, own in changed.items():
+            elements = np.asarray(places[k])
+            if elements.dtype.kind not in "iu" or np.any((elements < 0) | (elements >= n)):
+                return
+            if key in own:
+                numbers[elements] = own[key]
+        values[key] = numbers
+    try:
+        check_limit(replace(porosity, **values))
+    except InputError as error:
+        raise InputError(f"{', '.join(f'region.{k}' for k in changed)}: {error}") from None
 
 
 def _check_hidden(regions: tuple[Region, ...], elements: int) -> None:
