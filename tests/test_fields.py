@@ -46,14 +46,14 @@ def content(**more) -> dict:
     } | more
 
 
-def shown(scene: lj.Scene, positions, names, pressure=None) -> dict:
+def shown(scene: lj.Scene, positions, names, pressure=None, start=None) -> dict:
     """Return fields at given positions (T, V, 3), as if they were the result of a run."""
     T = len(positions)
     zero = np.zeros(np.shape(positions))
     result = Result(
         times=np.arange(T), positions=positions, reactions=zero, status=np.zeros(T), pressure=pressure, statistics=None
     )
-    return fields.fields(scene, result, names)
+    return fields.fields(scene, result, names, start)
 
 
 @pytest.mark.parametrize("volumetric", ["element", "mixed"])
@@ -101,6 +101,21 @@ def test_a_held_viscous_body_relaxes():
     second = 0.5 + 0.5 * (1 - np.exp(-h)) / h * np.exp(-h)
     assert np.allclose(stress[0], first * elastic[0], rtol=1e-9, atol=1e-9)
     assert np.allclose(stress[1], second * elastic[1], rtol=1e-9, atol=1e-9)
+
+
+def test_a_body_that_begins_strained_relaxes_from_there():
+    """A dynamic run begins with the whole elastic stress at `start`. The fields began at the reference positions."""
+    moving = {"body": {"density": 1000.0}, "solve": {"dt": 0.1, "steps": 2, "kind": "dynamic"}}
+    viscous, plain = (
+        scene_from(content(**moving, **more))
+        for more in ({"viscosity": {"ratios": [0.5], "relaxation_times": [0.1]}}, {})
+    )
+    x = np.asarray(viscous.mesh.points) @ np.diag([1.3, 0.9, 0.95])
+    stress, elastic = (
+        shown(s, np.stack([x, x]), ["cauchy_stress"], start=x)["cauchy_stress"] for s in (viscous, plain)
+    )
+    left = 0.5 + 0.5 * np.exp(-np.array([1.0, 2.0]))
+    assert np.allclose(stress, left[:, None, None, None] * elastic, rtol=1e-9, atol=1e-9)
 
 
 def test_fluid_flows_down_the_pressure():

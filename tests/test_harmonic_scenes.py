@@ -125,6 +125,16 @@ def test_what_moves_in_time_is_no_harmonic_motion(tmp_path, capsys, part, words)
     assert words in capsys.readouterr().err
 
 
+def test_a_heavy_body_under_a_pressed_obstacle_is_no_harmonic_motion(tmp_path, capsys):
+    """The run under gravity came first, and its message demanded a time step."""
+    heavy = FILE.replace("density = 1000.0", "density = 1000.0\ngravity = [0.0, 0.0, -9.81]")
+    pressed = "[[obstacle]]\nshape = 'plane'\nposition = [0, 0, 0.01]\naxis = [0, 0, -1]\nforce = [0, 0, -0.01]\n"
+    scene = tmp_path / "scene.toml"
+    scene.write_text(heavy + "frequencies = [60.0]\n" + pressed)
+    assert main(["simulate", str(scene), "--out", str(tmp_path / "out")]) == 2
+    assert "friction and pressed obstacles cannot be used in harmonic motion" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("line", "more", "words"),
     [

@@ -114,6 +114,21 @@ def test_prescribed_motion_and_histories_are_those_of_the_full_model():
     assert np.abs(x - lj.simulate(scene).check().positions).max() < 1e-5 * 0.004
 
 
+def test_a_reduced_run_needs_the_time_and_the_mass_of_the_full_run():
+    """Without a time step, a history counted as its value at time 0, and without a mass the body had no inertia."""
+    still = replace(_bar((1, 1, 1), solve=lj.Solve(steps=3)), body=None)
+    end = jnp.asarray(lj.boundary.select(still.mesh, {"x_min": 0.03}, None, "displaced"))
+    moved = lj.Displaced(nodes=end, by=jnp.array([0.01, 0.0, 0.0]))
+    given = replace(moved, times=jnp.arange(4.0), history=jnp.array([0.0, 1.0, 2.0, 3.0]))
+    for scene, changes, words in (
+        (replace(still, displaced=(moved,)), {"displaced": (given,)}, "has no dt, which a history needs"),
+        (_bar((1, 1, 1), solve=MOVING), {"body": None}, "kind = 'dynamic' needs mass"),
+    ):
+        model = with_all_points(scene, every_motion(scene))
+        with pytest.raises(lj.InputError, match=words):
+            lj.simulate_reduced(model, replace(scene, **changes))
+
+
 @pytest.mark.slow
 def test_a_body_that_is_only_moved_converges():
     # Without a load the forces of the points cancel at the solution, so their sum is no scale for a comparison.

@@ -7,7 +7,9 @@ import pytest
 
 import liverjax as lj
 from liverjax.core.struct import replace
+from liverjax.scenes.by_element import by_element
 from liverjax.scenes.checks.regions import check_region_viscosity
+from liverjax.scenes.scene_checks import check_scene
 from liverjax.scenes.scene_file import scene_from
 from liverjax.waves.harmonic import element_operator
 
@@ -165,5 +167,27 @@ def test_scenes_without_viscosity_and_reduced_models_refuse_it():
     short = lj.Region(elements=jnp.array([0]), viscosity={"ratios": jnp.array([0.2])})
     with pytest.raises(lj.InputError, match="1 numbers, but the scene has 2 modes"):  # from Python, before compilation
         lj.simulate(block(region=(short,)))
-    with pytest.raises(lj.InputError, match="a reduced model can have only one viscosity"):
-        lj.reduce_scene(block(region=(region,)), {"law.mu": [800.0]})
+    plain = block()
+    each = {key: jnp.tile(numbers[:, None], plain.mesh.number_of_elements) for key, numbers in LIVER.items()}
+    for scene in (block(region=(region,)), block(viscosity=each)):
+        with pytest.raises(lj.InputError, match="a reduced model can have only one viscosity"):
+            lj.reduce_scene(scene, {"law.mu": [800.0]})
+
+
+@pytest.mark.parametrize("keys", [["ratios"], ["relaxation_times"], ["ratios", "relaxation_times"]])
+def test_a_region_changes_a_viscosity_with_values_per_element(keys):
+    """This gave an error of shapes, or a false sentence about the numbers of ratios and times."""
+    mesh = block().mesh
+    half = lower(mesh)
+    each = {key: jnp.tile(numbers[:, None], mesh.number_of_elements) for key, numbers in LIVER.items()}
+    scene = block(viscosity=each, region=(lj.Region(elements=half, viscosity={key: LESION[key] for key in keys}),))
+    check_scene(scene)
+    found = by_element(scene).viscosity
+    for key, numbers in each.items():
+        wanted = np.array(numbers)
+        if key in keys:
+            wanted[:, np.asarray(half)] = np.asarray(LESION[key])[:, None]
+        np.testing.assert_array_equal(getattr(found, key), wanted)
+    wrong = lj.Region(elements=half, viscosity={"ratios": jnp.array([0.6, 0.5])})
+    with pytest.raises(lj.InputError, match=r"region\.0: viscosity\.ratios = .* must add up to less than 1"):
+        check_region_viscosity(scene.viscosity, wrong, "region.0")

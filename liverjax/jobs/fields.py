@@ -12,6 +12,7 @@ import numpy as np
 
 from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
+from liverjax.core.struct import Number
 from liverjax.elements.gradients import volume_gradients
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End
@@ -46,7 +47,7 @@ def check(names: list[str], scene: Scene) -> None:
         raise InputError("[output] fields contains fluid_velocity, which needs [porosity]: remove fluid_velocity")
 
 
-def fields(scene: Scene, result: Result, names: list[str]) -> dict[str, np.ndarray]:
+def fields(scene: Scene, result: Result, names: list[str], start: Number | None = None) -> dict[str, np.ndarray]:
     """Return fields (T, E, …) of a finished run at T steps, as means over each element.
 
     The fields are cauchy_stress (3, 3) [Pa] including the fluid pressure, green_strain (3, 3), principal_stretches (3,)
@@ -57,13 +58,15 @@ def fields(scene: Scene, result: Result, names: list[str]) -> dict[str, np.ndarr
         scene: the scene of the run.
         result: the result of the run.
         names: some of `FIELDS`.
+        start: the positions (V, 3) [m] at which the run began, as for `simulate`; None: the reference positions.
 
     Raises:
         InputError: a field is unknown, or needs a porous body that the scene does not have.
     """
     check(names, scene)
     scene, names = prepared(scene), list(dict.fromkeys(names))
-    sizes, state = force_sizes(scene), initial_state(scene)
+    begin = None if start is None else jnp.asarray(start, scene.mesh.points.dtype)
+    sizes, state = force_sizes(scene), initial_state(scene, begin)
     rows: dict[str, list[np.ndarray]] = {name: [] for name in names}
     for k, x in enumerate(np.asarray(result.positions)):
         pressure = None if result.pressure is None else jnp.asarray(result.pressure[k])

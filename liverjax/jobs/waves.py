@@ -27,7 +27,7 @@ from liverjax.simulation.equations import forces_at
 from liverjax.simulation.run import prepared
 from liverjax.simulation.unloaded import resting
 from liverjax.waves.cautions import cautions_of_waves
-from liverjax.waves.harmonic import Harmonic, harmonic, largest_in_period
+from liverjax.waves.harmonic import Harmonic, harmonic, largest_in_period, refuse_not_harmonic
 from liverjax.waves.mesh_error import HarmonicError, harmonic_errors
 from liverjax.waves.rest import under_its_weight
 
@@ -60,6 +60,7 @@ def solved_waves(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
     Raises:
         InputError: `harmonic` cannot solve the scene, or the file `about` is not a result of this mesh.
     """
+    refuse_not_harmonic(scene)  # before the run under gravity, whose messages do not fit harmonic motion
     x, reactions = (under_its_weight(scene), None) if about is None else _last_state(about, scene)
     begin = time.perf_counter()
     found = jax.block_until_ready(harmonic(scene, about=x))

@@ -245,14 +245,19 @@ def initial_fluid(porosity: Porosity, mesh: TetMesh) -> Fluid:
 
 
 def inflow(porosity: Porosity, mesh: TetMesh, time: Number, dt: Number) -> tuple[jax.Array, jax.Array]:
-    """Return the given pressures (V,) [Pa] at a time [s], and the inflow (V,) [m^3] during dt, for `darcy.Flow`."""
+    """Return the given pressures (V,) [Pa] and the inflow (V,) [m^3] of a step, for `darcy.Flow`.
+
+    The step has the length dt [s] and ends at `time` [s]. The pressures are those at its end. A flux is linear within
+    a step, so the inflow is dt times the mean of the fluxes at the beginning and at the end of the step.
+    """
     given = enters = jnp.zeros(mesh.number_of_vertices, mesh.points.dtype)
     for inlet in porosity.inlet:
         if inlet.nodes is not None:
             given = given.at[inlet.nodes].set(inlet.at(inlet.pressure, time), mode="drop")
         else:
             normal = areas(mesh.points, inlet.triangles)
-            volume = dt * inlet.at(inlet.flux, time) * jnp.sqrt(jnp.sum(normal * normal, axis=1)) / 3
+            flux = 0.5 * (inlet.at(inlet.flux, time - dt) + inlet.at(inlet.flux, time))
+            volume = dt * flux * jnp.sqrt(jnp.sum(normal * normal, axis=1)) / 3
             for a in range(3):
                 enters = enters.at[inlet.triangles[:, a]].add(volume)
     return given, enters

@@ -169,14 +169,15 @@ def refuse_unknown_physics(scene: Scene) -> None:
     """Raise InputError if the scene has entries that reduced models do not support.
 
     Raises:
-        InputError: the scene has regions with a separate viscosity or another kind of law, inlets of a fluid, physics
-            objects other than supports, a mesh of the loaded body, or pressures that follow the surface. Other reasons
-            are averaged or mixed volumes, a consistent mass matrix, viscosity without a time step, a precision other
-            than "float64", or a setting of newton other than "converged".
+        InputError: the scene has a viscosity per element, regions with a separate viscosity or another kind of law,
+            inlets of a fluid, physics objects other than supports, a mesh of the loaded body, or pressures that follow
+            the surface. Other reasons are averaged or mixed volumes, a consistent mass matrix, viscosity without a time
+            step, a precision other than "float64", or a setting of newton other than "converged".
     """
-    if any(region.viscosity for region in scene.region):
+    by_element = scene.viscosity is not None and jnp.asarray(scene.viscosity.ratios).ndim == 2
+    if by_element or any(region.viscosity for region in scene.region):
         raise InputError(
-            "a reduced model can have only one viscosity: remove the viscosity of regions, or run the full model"
+            "a reduced model can have only one viscosity: give one series for the whole body, or run the full model"
         )
     if len(laws_of(scene.law, scene.region)) > 1:
         raise InputError(

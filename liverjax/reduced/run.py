@@ -45,7 +45,7 @@ from liverjax.reduced.step import (
 )
 from liverjax.reduced.tangent import in_single_precision
 from liverjax.scenes.scene import Scene
-from liverjax.scenes.scene_checks import check_before_run
+from liverjax.scenes.scene_checks import check_before_run, check_time_and_mass
 from liverjax.tensors.matrices import determinant
 
 
@@ -227,10 +227,12 @@ def simulate_reduced(model: ReducedModel, scene: Scene) -> ReducedResult:
             viscosity, porosity, supports and body may be changed.
 
     Raises:
-        InputError: the model was made for another scene, or the scene has numbers that `simulate` does not allow.
+        InputError: the model was made for another scene, the scene has numbers that `simulate` does not allow, or a
+            time step or a mass is missing.
     """
     refuse_another_scene(model, scene)
     check_before_run(scene)
+    check_time_and_mass(scene)
     return _reduced_run(without_rows(model), scene)
 
 

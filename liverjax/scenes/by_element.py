@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core import names
-from liverjax.core.struct import Content, replace
+from liverjax.core.struct import Content, Numbers, replace
 from liverjax.laws import Law
 from liverjax.laws.by_region import ByRegion
 from liverjax.mesh.tetrahedra import TetMesh
@@ -84,7 +84,7 @@ def viscosity_of_elements(prony: Prony, regions: tuple[Region, ...], number_of_e
             if region.viscosity and name in region.viscosity
         }
         if own:
-            base = jnp.asarray(getattr(prony, name), float)[:, None]
+            base = _per_element(getattr(prony, name))
             numbers = jnp.broadcast_to(base, (base.shape[0], number_of_elements))
             for k, values in own.items():
                 numbers = numbers.at[:, regions[k].elements].set(jnp.asarray(values, float)[:, None])
@@ -92,8 +92,14 @@ def viscosity_of_elements(prony: Prony, regions: tuple[Region, ...], number_of_e
     if not found:
         return prony
     shape = next(iter(found.values())).shape
-    plain: Content = {n: jnp.broadcast_to(jnp.asarray(getattr(prony, n), float)[:, None], shape) for n in VISCOUS}
+    plain: Content = {n: jnp.broadcast_to(_per_element(getattr(prony, n)), shape) for n in VISCOUS}
     return replace(prony, **plain | found)
+
+
+def _per_element(values: Numbers) -> jax.Array:
+    """Return the numbers (N,) of the modes as (N, 1); numbers per element (N, E) are returned as they are."""
+    found = jnp.asarray(values, float)
+    return found if found.ndim == 2 else found[:, None]
 
 
 def porosity_of_elements(porosity: Porosity, regions: tuple[Region, ...], mesh: TetMesh) -> Porosity:

@@ -279,12 +279,13 @@ def _check_memory(mesh: TetMesh) -> None:
         )
 
 
-def _small(scene: Scene, mass: str) -> Scene:
-    """Return the scene without time and gravity. Raise InputError if it contains something that is not implemented for
-    harmonic motion."""
-    if mass not in MASSES:
-        raise InputError(f"mass = {mass!r} is not known: use {' or '.join(MASSES)}")
-    _check_memory(scene.mesh)
+def refuse_not_harmonic(scene: Scene) -> None:
+    """Raise InputError if the scene contains something that harmonic motion cannot have.
+
+    Raises:
+        InputError: the scene has a mesh of the loaded body, friction, a pressed obstacle, or a pressure that follows
+            the surface.
+    """
     if scene.points_are == "loaded":
         raise InputError(
             '[mesh] is = "loaded" cannot be used in harmonic motion: use the scene of lj.unloaded(scene), and give the '
@@ -299,6 +300,15 @@ def _small(scene: Scene, mass: str) -> Scene:
         raise InputError(
             "a pressure that follows the body cannot be used in harmonic motion: give traction.value instead"
         )
+
+
+def _small(scene: Scene, mass: str) -> Scene:
+    """Return the scene without time and gravity. Raise InputError if it contains something that is not implemented for
+    harmonic motion."""
+    if mass not in MASSES:
+        raise InputError(f"mass = {mass!r} is not known: use {' or '.join(MASSES)}")
+    _check_memory(scene.mesh)
+    refuse_not_harmonic(scene)
     solve = replace(scene.solve, **_STILL)
     traction = tuple(replace(t, times=None, history=None) for t in scene.traction)
     body = None if scene.body is None else replace(scene.body, gravity=jnp.zeros(3), times=None, history=None)

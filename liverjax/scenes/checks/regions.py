@@ -138,6 +138,8 @@ def check_region_viscosity(prony: Prony | None, region: Region, name: str) -> No
     if any(isinstance(value, jax.core.Tracer) for value in (*own.values(), prony.ratios)):
         return
     changed: Content = {key: np.asarray(value, float) for key, value in own.items()}
+    if np.ndim(prony.ratios) == 2:  # the scene has one series per element
+        changed = {key: np.broadcast_to(value[:, None], np.shape(prony.ratios)) for key, value in changed.items()}
     try:
         check_series(replace(prony, **changed))
     except InputError as error:
