@@ -112,3 +112,14 @@ def test_a_posterior_says_that_it_takes_noise_as_independent(tmp_path):
     content = json.loads((tmp_path / "fit.json").read_text())
     assert content["details"][alike_points.INDEPENDENT] < 40
     assert any("assumes independent noise of all moduli" in w for w in content["warnings"])
+
+
+def test_one_repeated_frequency_keeps_the_correction():
+    """Before, one repeated frequency switched off the correction and its warning."""
+    s = drifting(3, 5.0)
+    s = s._replace(**{q: np.insert(v, 10, 0.98 * v[10]) for q, v in zip(Sweep._fields[1:3], s[1:3], strict=True)})
+    s = s._replace(angular_frequency=np.insert(OMEGA, 10, OMEGA[10]))
+    plain = viscoelastic.closed_form(s, 2)
+    fit = alike_points.with_alike_points(plain, s)
+    assert fit.warnings[-1].startswith(alike_points.SHARED)
+    assert fit.uncertainty.standard_errors[0] > 1.5 * plain.uncertainty.standard_errors[0]

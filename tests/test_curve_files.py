@@ -69,10 +69,10 @@ def test_several_ratios_of_the_stretches_are_no_return(tmp_path):
 
     def notes_of(ratios) -> list[str]:
         lines = ["F11,F22,F33,P11_Pa,P22_Pa"]
-        for ratio in ratios:
+        for k, ratio in enumerate(ratios):
             for e in np.linspace(0.02, 0.25, 8):
                 a, b = 1 + e, 1 + ratio * e
-                P, Q = (200 * (own - 1 / (a * b) ** 2 / own) for own in (a, b))
+                P, Q = ((200 + k) * (own - 1 / (a * b) ** 2 / own) for own in (a, b))
                 lines.append(f"{a:.9f},{b:.9f},{1 / (a * b):.9f},{P:.9g},{Q:.9g}")
         (tmp_path / "b.csv").write_text("\n".join(lines) + "\n")
         return [note for note in curves.read_curves([tmp_path / "b.csv"])[1] if "reverses" in note]
@@ -339,3 +339,19 @@ def test_a_column_of_deviations_is_not_the_column_of_the_stress(tmp_path):
     (tmp_path / "c.csv").write_text(f"test,stretch,nominal_stress_sd_kPa,nominal_stress_kPa\n{rows}")
     (found,), notes = curves.read_curves([tmp_path / "c.csv"])
     assert np.allclose(found.stress, 1e3 * np.arange(1, 9)) and not any("without a stress" in note for note in notes)
+
+
+def test_copies_of_all_rows_count_once(tmp_path):
+    """Each copy counted as a measurement, so the errors were too small, and the law was called inadequate."""
+    rows = [f"uniaxial,{1 + 0.01 * k:.2f},,{0.03 * k:.2f}\n" for k in range(12)]
+    held = rows[:6] + rows[5:6] * 4 + rows[6:]  # rows of a held load are no copies
+    shear = [f"simple_shear,,{0.1 * k:.1f},{0.1 * k:.1f}\n" for k in range(5)]
+    file, found = tmp_path / "c.csv", []
+    for written in (held, [row for row in held for _ in (0, 1)], held + held, held + shear + shear):
+        file.write_text("test,stretch,shear,nominal_stress_kPa\n" + "".join(written))
+        found.append(curves.read_curves([file]))
+    assert found[0][1] == []
+    for read, notes in found[1:]:
+        assert np.array_equal(read[0].stress, found[0][0][0].stress)
+        assert len(notes) == 1 and "rows are ignored, because they are copies of other rows" in notes[0]
+    assert len(found[3][0][1].stress) == 5 and "c.csv: 5 rows are" in found[3][1][0]

@@ -174,3 +174,22 @@ def test_a_viscosity_beside_moduli_of_tension_contradicts_nothing(tmp_path):
         lines = [f"{w:.6g},{s:.6g},{k:.6g},{c:.6g}" for w, s, k, c in zip(omega, S, L, size, strict=True)]
         file.write_text("\n".join([f"omega [rad/s],E' [Pa],E'' [Pa],{heading}", *lines]))
         assert any("contradict" in n for n in read_sweep(file).notes) == (factor == 10.0)
+
+
+@pytest.mark.parametrize(("cell", "bad"), [("0", 5), ("0", 12), ("", 7), ("", 12)])
+def test_poor_deviations_cost_no_points(tmp_path, cell, bad):
+    """Before, each point without a usable standard deviation was ignored, or the sweep was refused."""
+    lines = [f"{k},{300 + k},{30 + k},{cell if k <= bad else 6},3\n" for k in range(1, 13)]
+    s = read_sweep(_write(tmp_path, HEADER.strip() + ",storage_sd_Pa,loss_sd_Pa\n" + "".join(lines)))
+    assert len(s.storage) == 12 and s.storage_sd is None and s.loss_sd is None
+    assert len(s.notes) == 1 and "(storage_sd_Pa, loss_sd_Pa) are not used" in s.notes[0]
+    assert f"{bad} of 12 points" in s.notes[0]
+
+
+def test_one_repeated_frequency_is_no_series_of_temperatures(tmp_path):
+    """Before, --master was advised, which refuses such a sweep."""
+    lines = [f"{k},{300 + k},{30 + k},{36 + k / 4}\n" for k in range(1, 13)]
+    for more, told in (([], "changes by 2.8 K"), (["3,304,34,36.5\n"], "changes by 2.8 K"), (lines, "--master")):
+        more = [row.replace(",3", ",4", 1) for row in more] if more is lines else more
+        s = read_sweep(_write(tmp_path, HEADER.strip() + ",temperature_C\n" + "".join(lines + more)))
+        assert len(s.storage) == 12 + len(more) and any(told in note for note in s.notes)

@@ -157,3 +157,24 @@ def test_few_points_of_equal_noise_seldom_look_like_an_error_of_the_phase(points
         s = Sweep(omega, G.real * spread[0], G.imag * spread[1])
         told += weighed_by_scatter(s) is not s
     assert told <= 200 * 0.02 + 2 * np.sqrt(200 * 0.02)
+
+
+def with_a_repeat(s: Sweep, k: int = 10, factor: float = 1.01) -> Sweep:
+    """Return the sweep with a second measurement at frequency k, whose moduli are `factor` times the first ones."""
+    names = ("storage", "loss", "storage_sd", "loss_sd")
+    columns = {q: np.insert(getattr(s, q), k, factor * getattr(s, q)[k]) for q in names if getattr(s, q) is not None}
+    omega = s.angular_frequency
+    return s._replace(angular_frequency=np.insert(omega, k, omega[k]), **columns)
+
+
+def test_one_repeated_frequency_keeps_the_weights():
+    """Before, one repeated frequency switched off the weights by scatter and the smoothing of the deviations."""
+    s = measured(modulus(), 1.0, 1)
+    assert weighed_by_scatter(s).sd_estimated and weighed_by_scatter(with_a_repeat(s)).sd_estimated
+    G = modulus()
+    sd = [0.02 * v * np.sqrt(np.random.default_rng(0).chisquare(2, len(v)) / 2) for v in (G.real, G.imag)]
+    plain = Sweep(OMEGA, G.real, G.imag, *sd)
+    part = [np.std(np.log(own.deviations[0] / own.storage)) for own in (plain, with_a_repeat(plain))]
+    assert part[1] < 1.2 * part[0] < 0.5
+    every = plain._replace(**{q: np.repeat(v, 2) for q, v in zip(Sweep._fields[:5], plain[:5], strict=True)})
+    assert np.array_equal(every.deviations[0], every.storage_sd)

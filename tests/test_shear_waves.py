@@ -231,3 +231,13 @@ def test_the_density_of_a_common_fit_needs_no_height():
         ["sweep.csv", "--with", "waves.csv", "--density", "1060", "--method", "closed-form"]
     )
     assert sweep_command._check(options) is None  # no error
+
+
+def test_copies_of_all_rows_are_left_out(tmp_path):
+    """Each copy counted as a measurement, and the residuals looked structured. An equal row alone may be a repeat."""
+    rows = "50,1.5\n60,1.6\n70,1.7\n80,1.8\n"
+    for text, number in ((rows, 4), (2 * rows, 4), (rows.replace("\n", "\n50,1.5\n", 1), 5)):
+        (tmp_path / "w.csv").write_text("frequency_Hz,velocity_m/s\n" + text)
+        found = dispersion.read_dispersion(tmp_path / "w.csv", 1000.0)
+        assert len(found.velocity) == number
+        assert len(found.notes) == (text == 2 * rows) and all("4 of 8 rows are ignored" in n for n in found.notes)

@@ -16,7 +16,7 @@ from fitting.methods.host import Array
 from fitting.methods.least_squares import ZERO, Solution, bfgs, from_starts
 from fitting.methods.noise.factor_noise import factors_of_series
 from fitting.methods.noise.uneven_noise import root_of_sizes, sizes_shown
-from fitting.readers.frequency_sweep import check_sweep
+from fitting.readers.frequency_sweep import check_sweep, mostly_repeated
 from fitting.readers.rheometer import Sweep
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
@@ -264,9 +264,9 @@ def _of_repeats(J: np.ndarray, r: np.ndarray, omega: np.ndarray) -> np.ndarray |
     """Return the square root of the covariance of the unknowns for noise that is correlated between repeated values of
     G', or of G'', at one frequency. Returns None if the residuals show no such noise."""
     of_row = np.concatenate([omega, omega + 2 * omega.max()])  # G' and G'' form separate groups
-    _, group, counts = np.unique(of_row, return_inverse=True, return_counts=True)
-    if np.median(counts) < 2:
+    if not mostly_repeated(omega):
         return None
+    _, group, counts = np.unique(of_row, return_inverse=True, return_counts=True)
     order = np.argsort(group, kind="stable")
     shared = factors_of_series(counts.tolist(), J[order], r[order], np.ones(len(r)), np.eye(J.shape[1]))
     return shared.root if shared is not None and shared.shown else None

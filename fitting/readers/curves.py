@@ -17,6 +17,7 @@ from fitting.readers.tables.text_tables import (
     summary_rows,
     text_of,
     to_number,
+    without_multiples,
 )
 from fitting.readers.units import STRESS_UNITS
 from liverjax.core.errors import InputError
@@ -113,6 +114,10 @@ def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[
         ]
         rows, left_out = _measured_rows(file, rows)
         notes += [f"{file.name}: {left_out} rows without a stress are ignored"] if left_out else []
+        rows, left_out = _rows_without_copies(rows)
+        notes += (
+            [f"{file.name}: {left_out} rows are ignored, because they are copies of other rows"] if left_out else []
+        )
         spreads = [name for name in rows[0] if _SPREAD.search(name)]
         if spreads:
             notes.append(
@@ -194,6 +199,19 @@ def _measured_rows(file: Path, rows: list[dict[str, str]]) -> tuple[list[dict[st
     column = _stress_column(file, rows[0], "nominal_stress", "Pa")
     kept = rows if column is None else [row for row in rows if row[column[0]].lower() not in EMPTY]
     return (kept, len(rows) - len(kept)) if kept else (rows, 0)
+
+
+def _rows_without_copies(rows: list[dict[str, str]]) -> tuple[list[dict[str, str]], int]:
+    """Return the rows without copies, and the number of copies. The rows of a test contain copies only if every row of
+    this test was written several times, with the same text in all cells."""
+    groups: dict[str, list[dict[str, str]]] = {}
+    for row in rows:
+        groups.setdefault(row.get("test", ""), []).append(row)
+    kept: set[str] = set()
+    for own in groups.values():
+        cells = [tuple(cell for name, cell in row.items() if name != "row") for row in own]
+        kept |= {own[k]["row"] for k in without_multiples(cells)}
+    return [row for row in rows if row["row"] in kept], len(rows) - len(kept)
 
 
 def _row_under(names: list[str], cells: list[str], file: Path) -> dict[str, str]:

@@ -228,15 +228,16 @@ def _smooth_of_bytes(*columns: bytes) -> np.ndarray:
     """Compute `smooth_deviations` from the bytes of its columns."""
     omega, modulus, sd = (np.frombuffer(column) for column in columns)
     x, part, curve = np.log(omega), np.log(sd / modulus), smooth_curve(omega, modulus)
+    at, of_modulus, of_sd = merged(x, part, np.log(sd))
     # Standard deviations in percent of the measured moduli contain the noise of the moduli. So they are computed as
     # percent of the smooth curve.
     if np.ptp(part) < _ROUNDED:
         return sd * curve / modulus
-    if len(np.unique(x)) < max(_POINTS, len(x)):
+    if len(at) < _POINTS or mostly_repeated(omega):
         return sd
-    off = distance_from_smooth(x, part)
+    off = distance_from_smooth(at, of_modulus)
     if off < _FEW_REPEATS:
-        return sd * curve / modulus if off < 0.5 * distance_from_smooth(x, np.log(sd)) else sd
+        return sd * curve / modulus if off < 0.5 * distance_from_smooth(at, of_sd) else sd
     smooth = curve * np.exp(np.polyval(np.polyfit(x - x.mean(), part, _DEGREE), x - x.mean()))
     return smooth * np.sqrt(np.mean((sd / smooth) ** 2))  # then the mean square of sd / result is 1
 
@@ -246,6 +247,11 @@ def merged(omega: np.ndarray, *columns: np.ndarray) -> tuple[np.ndarray, ...]:
     different, place = np.unique(omega, return_inverse=True)
     count = np.bincount(place)
     return different, *(np.bincount(place, column) / count for column in columns)
+
+
+def mostly_repeated(omega: np.ndarray) -> bool:
+    """Return whether most of the different frequencies occur several times: their median number is 2 or more."""
+    return bool(np.median(np.unique(omega, return_counts=True)[1]) >= 2)
 
 
 def within(sweep: Sweep, low: float | None, high: float | None) -> Sweep:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 # Some of these names are imported only for users: `fitting.rheometer` exports all names of this module.
-from fitting.readers.frequency_sweep import FEWEST, Sweep, without_copies
+from fitting.readers.frequency_sweep import FEWEST, Sweep, mostly_repeated, without_copies
 from fitting.readers.frequency_sweep import some as some
 from fitting.readers.frequency_sweep import within as within
 from fitting.readers.frequency_sweep import without_inertia as without_inertia
@@ -36,7 +36,8 @@ def read_sweep(path: str | os.PathLike, table: str | None = None) -> Sweep:
 
     A point is ignored if a modulus or the frequency is not finite, not positive, or outside of `SMALLEST` to
     `LARGEST`. A note names these points. A point is also ignored if it is a copy of another point: a line with the same
-    numbers in all columns that are used.
+    numbers in all columns that are used. Standard deviations are not used if too many of them are empty or not
+    positive.
 
     Args:
         path: an instrument's export, or text with a header that names ``frequency_Hz`` or ``angular_frequency_rad_s``,
@@ -59,6 +60,28 @@ def read_all_sweeps(path: str | os.PathLike) -> list[tuple[str, Sweep]]:
     does not weight the points by their scatter."""
     tables = tables_of(str(path), text_of(Path(path)).splitlines())
     return [(table.name, _sweep(str(path), table, [])) for table in tables]
+
+
+#: Standard deviations are not used if they are missing or unusable at more than this part of the usable points [1]. If
+#: they are unusable at fewer points, these points are ignored.
+WITHOUT_SD = 0.25
+
+
+def _poor_deviations(table: Table, values: dict[int, np.ndarray]) -> list[str]:
+    """Return a note if the standard deviations in `values` are unusable at too many points (`WITHOUT_SD`)."""
+    names = {j: table.columns[j].name for j in values if table.columns[j].quantity.endswith("_sd")}
+
+    def bad(k: int, j: int) -> bool:
+        return fault_of(table.columns[j], table.rows[k][j], values[j][k], SMALLEST, LARGEST) is not None
+
+    rows = [k for k in range(len(table.rows)) if not any(bad(k, j) for j in values if j not in names)]
+    poor = sum(any(bad(k, j) for j in names) for k in rows)
+    if poor <= WITHOUT_SD * len(rows):
+        return []
+    return [
+        f"the standard deviations ({', '.join(names.values())}) are not used, because they are empty, not "
+        f"positive or too large at {poor} of {len(rows)} points: fill in these cells to use them"
+    ]
 
 
 def _usable(path: str, table: Table, values: dict[int, np.ndarray]) -> tuple[np.ndarray, list[str]]:
@@ -128,9 +151,17 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
             columns[j] = column_in_si(path, column, written[:, j], notes)
             first[column.quantity] = column, columns[j]
     notes += (stretched := to_shear(first))
+    if poor := _poor_deviations(table, columns):
+        notes += poor
+        first = {q: own for q, own in first.items() if not q.endswith("_sd")}
+        columns = {j: v for j, v in columns.items() if table.columns[j].quantity in first}
     good, left_out = _usable(path, table, columns)
     for j, column in enumerate(table.columns):
-        if j not in columns and known_unit(column.quantity.removesuffix("_sd"), column.unit):
+        if (
+            j not in columns
+            and column.quantity in first
+            and known_unit(column.quantity.removesuffix("_sd"), column.unit)
+        ):
             _check_agreement(path, first, column, written[:, j], good)
     notes += [*left_out, *_below_zero(first, good), *_unlike_units(first, good)]
     values = {q: v[good] for q, (_, v) in first.items()}
@@ -174,7 +205,7 @@ def _what_differs(sweep: Sweep) -> list[str]:
     """Return notes if temperature or strain differ between the lines of a sweep."""
     out, raw = [], sweep.raw or {}
     heat, strain = (raw[q][np.isfinite(raw[q])] if q in raw else np.empty(0) for q in ("temperature", "strain"))
-    if len(np.unique(sweep.angular_frequency)) == len(sweep.angular_frequency):
+    if not mostly_repeated(sweep.angular_frequency):
         if heat.size and np.ptp(heat) > WARMER:
             out.append(
                 f"the temperature changes by {np.ptp(heat):.2g} K in the sweep, and the fit treats the effect of "

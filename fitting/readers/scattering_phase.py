@@ -2,7 +2,13 @@
 
 import numpy as np
 
-from fitting.readers.frequency_sweep import Sweep, distance_from_smooth, distances_from_polynomials
+from fitting.readers.frequency_sweep import (
+    Sweep,
+    distance_from_smooth,
+    distances_from_polynomials,
+    merged,
+    mostly_repeated,
+)
 
 #: Phase errors may be the cause of the scatter of G'' if its relative scatter exceeds both _SCATTERS and _MORE times
 #: the relative scatter of G'. With few points (n), the ratio of the two scatters can be larger by chance, so _MORE is
@@ -26,13 +32,13 @@ def weighed_by_scatter(sweep: Sweep) -> Sweep:
     The error of G'' is the phase error [rad] times G'. If the residuals were divided by G'', points that are low by
     chance would have the largest weight. Where G'' << G', the model would then fit the noise.
     """
-    omega, size = sweep.angular_frequency, np.hypot(sweep.storage, sweep.loss)
-    if sweep.storage_sd is not None or len(np.unique(omega)) < max(len(omega), _FEWEST):
+    size = np.hypot(sweep.storage, sweep.loss)
+    x, sine, log_storage = merged(np.log(sweep.angular_frequency), sweep.loss / size, np.log(sweep.storage))
+    if sweep.storage_sd is not None or len(x) < _FEWEST or mostly_repeated(sweep.angular_frequency):
         return sweep
-    x, sine = np.log(omega), sweep.loss / size
     if (len(x) - 1) * np.log(10) < _PER_DECADE * np.ptp(x) * (1 - 1e-6):
         return sweep
-    storage, phase = (distance_from_smooth(x, y) for y in (np.log(sweep.storage), sine))
+    storage, phase = (distance_from_smooth(x, y) for y in (log_storage, sine))
     scatters = float(np.median(phase * size / sweep.loss))
     if not (scatters > _SCATTERS and scatters > _MORE * (1 + _BY_CHANCE / len(x)) * storage):
         return sweep
@@ -43,7 +49,7 @@ def weighed_by_scatter(sweep: Sweep) -> Sweep:
         f"the phase is {np.degrees(phase):.2g} degrees, or because of outliers. So the residuals of G'' are divided by "
         "|G*|, not by G''; give standard deviations if you want other weights"
     )
-    storage_sd = np.maximum(storage, phase * sine) * sweep.storage
+    storage_sd = np.maximum(storage, phase * sweep.loss / size) * sweep.storage
     return sweep._replace(storage_sd=storage_sd, loss_sd=phase * size, sd_estimated=True, notes=(*sweep.notes, note))
 
 

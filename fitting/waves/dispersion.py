@@ -10,7 +10,7 @@ import numpy as np
 import scipy.special
 
 from fitting.readers.frequency_sweep import distances_from_polynomials, merged, smooth_curve
-from fitting.readers.tables.text_tables import split_line, text_of, to_number
+from fitting.readers.tables.text_tables import split_line, text_of, to_number, without_multiples
 from fitting.readers.units import WAVE_UNITS
 from fitting.waves.shear_waves import DENSITY
 from liverjax.core.errors import InputError
@@ -103,6 +103,11 @@ def read_dispersion(path: str | os.PathLike, density: float | None = None) -> Di
         [] if density is not None else [f"a density of {DENSITY:g} kg/m^3 is assumed: change this value with --density"]
     )
     columns = _columns(str(path), lines, header)
+    rows = np.column_stack(list(columns.values()))
+    kept = without_multiples([tuple(row) for row in rows.tolist()])
+    if len(kept) < len(rows):
+        notes.append(f"{len(rows) - len(kept)} of {len(rows)} rows are ignored, because they are copies of other rows")
+        columns = {q: v[kept] for q, v in columns.items()}
     order = np.argsort(columns["frequency"], kind="stable")
     columns = {q: v[order] for q, v in columns.items()}
     for quantity, values in columns.items():

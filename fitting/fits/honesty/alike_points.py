@@ -12,7 +12,7 @@ from fitting.fits.viscoelastic import EXACT, Fit, sizes_of_noise
 from fitting.methods import host, uncertainty
 from fitting.methods.estimate import Estimate, errors_and_correlation, wider
 from fitting.methods.noise.alike_noise import LOST, Alike, along_rows
-from fitting.readers.frequency_sweep import Sweep
+from fitting.readers.frequency_sweep import Sweep, mostly_repeated
 
 #: Key in `Fit.details`: the number of moduli with independent noise that carry the same information as the measured
 #: moduli.
@@ -28,9 +28,8 @@ SHARED = "the noise of neighbouring frequencies is correlated"
 
 def with_alike_points(fit: Fit, sweep: Sweep) -> Fit:
     """Return the fit with standard errors for noise that is correlated between neighbouring frequencies, if the
-    residuals show such noise."""
-    repeated = len(np.unique(sweep.angular_frequency)) < len(sweep.angular_frequency)
-    alike = None if repeated else alike_of(fit)
+    residuals show such noise. If most frequencies are repeated, the fit is returned unchanged."""
+    alike = None if mostly_repeated(sweep.angular_frequency) else alike_of(fit)
     if alike is None:
         return fit
     u, own = np.asarray(fit.solution.u), fit.parameters
@@ -50,7 +49,8 @@ def with_alike_points(fit: Fit, sweep: Sweep) -> Fit:
 
 def alike_of(fit: Fit) -> Alike | None:
     """Return the size and correlation length of noise that is correlated between neighbouring frequencies. Returns None
-    if the residuals show no such noise. No frequency may occur twice.
+    if the residuals show no such noise. Points with the same frequency count as neighbours, so only few frequencies may
+    occur twice.
 
     The function also returns None for exact data, and for spectra, because the errors of a spectrum come from a prior
     too.

@@ -4,6 +4,7 @@ import codecs
 import csv
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -211,6 +212,21 @@ def summary_rows(rows: list[list[str]]) -> dict[int, str]:
     own = labels[end:]
     distinct = len(set(own)) == len(own) and not set(own) & set(labels[:end])
     return dict(enumerate(own, end)) if end and distinct else {}
+
+
+def without_multiples(rows: list[tuple]) -> list[int]:
+    """Return the indices of the rows that remain after all copies are removed. Rows are copies only if every row was
+    written k times: the number of equal rows is then always a multiple of k. Other equal rows may be measurements with
+    the same result, for example while a load is held, so they remain."""
+    counts = Counter(rows)
+    copies = math.gcd(*counts.values())
+    seen: Counter[tuple] = Counter()
+    kept = []
+    for k, row in enumerate(rows):
+        seen[row] += 1
+        if seen[row] <= counts[row] // copies:
+            kept.append(k)
+    return kept
 
 
 def _label(row: list[str]) -> str:
