@@ -13,11 +13,12 @@ from fitting.__main__ import main
 from fitting.fits import simulated_rheometer, viscoelastic
 from fitting.fits.families import limits as family_limits
 from fitting.fits.families import models
+from fitting.fits.honesty import total_error
 from fitting.methods import as_prony_modes, generalised_maxwell, relaxation_spectrum, springpots, uncertainty
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.rheometer import Sweep, read_sweep
 from fitting.reports import sweep_report
-from liverjax import InputError
+from liverjax import InputError, laws
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -347,6 +348,40 @@ def test_options_that_do_not_go_together_are_refused(options, sentence, tmp_path
     file = ROOT / "data" / GIVEN["porcine liver"]
     assert main([str(file), *options, "--out", str(tmp_path)]) == 2
     assert sentence in capsys.readouterr().err
+
+
+def test_errors_of_the_discretisation_are_those_of_the_springpot():
+    """The time steps moved the exponent by several standard errors. The total error did not contain this change, and
+    the warnings named the internal Prony modes.
+    """
+    omega = 2 * np.pi * np.geomspace(0.01, 10, 20)
+    noise = 1 + 0.003 * np.random.default_rng(0).standard_normal((2, 20))
+    G = 300 * (1j * omega) ** 0.3
+    s = Sweep(omega, G.real * noise[0], G.imag * noise[1])
+    closed = next(f for f in models.fractional(s) if f.kind.name == "springpot")
+    simulation, law, scales = (
+        simulated_rheometer.Simulation(),
+        laws.typical("neo_hookean"),
+        np.concatenate(s.deviations),
+    )
+    fit = simulated_rheometer._with_biases(closed, (None, law, jnp.asarray(omega), scales), simulation)
+    material = simulated_rheometer.law_and_prony(closed.kind.maxwell(closed.solution.u), law, simulation)
+    in_steps, exact = (
+        np.asarray(G) for G in simulated_rheometer._of_no_mesh(*material, jnp.asarray(omega), simulation.steps)
+    )
+    G = s.storage + 1j * s.loss + exact - in_steps  # the fit of the simulation is about the fit to these data
+    moved = next(f for f in models.fractional(Sweep(omega, G.real, G.imag)) if f.kind.name == "springpot")
+    moved = moved._replace(parameters=fit.parameters._replace(values=moved.parameters.values))
+    shift = moved.parameters.values - closed.parameters.values
+    assert abs(shift[1]) > 2 * closed.parameters.standard_errors[1]
+    assert fit.parameters.time_step_bias == pytest.approx(shift, rel=0.1)
+    shares = total_error.error_shares(fit)
+    assert shares["time_step"] == pytest.approx(dict(zip(closed.kind.names, abs(shift), strict=True)), rel=0.1)
+    assert total_error.total_errors(fit)["exponent"] > abs(0.9 * shift[1])
+    told = simulated_rheometer._bias(closed, moved)
+    assert [w.split(":")[0] for w in told] == ["springpot", "exponent"]
+    errors = closed.parameters.standard_errors
+    assert simulated_rheometer.largest_shift(closed, moved) == pytest.approx(np.max(np.abs(shift) / errors))
 
 
 @pytest.mark.slow

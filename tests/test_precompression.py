@@ -11,10 +11,12 @@ import liverjax as lj
 from fitting import __main__ as command
 from fitting.fits import instrument
 from fitting.fits.families import models
+from fitting.fits.honesty.long_times import INTERVAL
 from fitting.fits.simulated_rheometer import Simulation, rig_of
 from fitting.methods import generalised_maxwell
 from fitting.methods.generalised_maxwell import Maxwell, weighed
 from fitting.readers.frequency_sweep import Sweep
+from fitting.reports import sweep_report
 from fitting.rigs import compression, glued, glued_compression, linear_torsion, torsion
 from fitting.waves.shear_waves import velocity_and_attenuation
 from liverjax.core.errors import InputError
@@ -277,6 +279,49 @@ def test_other_models_of_a_compressed_sample_give_its_numbers_at_rest(tmp_path, 
     assert np.allclose(storage + 1j * loss, true, rtol=0.02 if model == "spectrum" else 0.01)  # modes: 1 %
     moved = content["band_sensitivity"]["without_last_half_decade"]["equilibrium_modulus"]
     assert abs(moved) < 0.1 * own["equilibrium_modulus"]["value"]  # in units of the sample at rest
+
+
+def test_the_axial_force_is_that_of_the_fitted_model(law):
+    """The force was computed with the equilibrium modulus of the Prony modes. It was 36 % too large."""
+    omega, factors = 2 * np.pi * np.geomspace(0.1, 20, 25), compression.shares(law, STRAIN)
+    simulation, one_Pa = Simulation(precompression=STRAIN), compression.smooth_force(law, STRAIN, 0.01)
+    one_Pa /= float(law.shear_modulus())
+    x = (0.1j * omega) ** 0.4
+    G = 400 * factors.equilibrium + factors.relaxing * 1200 * x / (1 + x)
+    G *= 1 + 0.001 * np.random.default_rng(0).standard_normal(25)
+    sweep = Sweep(omega, G.real, G.imag)
+    (zener,) = (f for f in models.fractional(sweep) if f.kind.name == "fractional_zener")
+    fit = instrument.of_compressed_sample(zener, sweep, factors)
+    told = instrument.compression_numbers(fit, simulation)
+    rest, at_once = (float(v) for v in (fit.parameters.values[0], fit.parameters.values[:2].sum()))
+    assert rest == pytest.approx(400, rel=0.05) and fit.model.equilibrium_modulus > 1.2 * rest
+    assert told["axial_force_N"] == pytest.approx(one_Pa * rest, rel=1e-9)
+    assert told["axial_force_at_once_N"] == pytest.approx(one_Pa * at_once, rel=1e-9)
+    error = fit.parameters.standard_errors[0]
+    assert told["axial_force_standard_error_N"] == pytest.approx(one_Pa * error, rel=1e-9)
+    kept = compression.incompressible(law, STRAIN)
+    stands, parts = rest / at_once, zip(factors, kept, strict=True)
+    relaxing, standing = (a / b for a, b in parts)
+    assert told["modulus_if_incompressible"] == pytest.approx((1 - stands) * relaxing + stands * standing, rel=1e-9)
+
+
+def test_a_compressed_fluid_has_no_axial_force_after_relaxation(law):
+    """The roundoff of the ratios gave "1e-17 ± 0 N", and a springpot had the force of its slowest modes."""
+    omega, simulation = 2 * np.pi * np.geomspace(0.1, 20, 25), Simulation(precompression=STRAIN)
+    fluid = Maxwell(np.float64(1000.0), np.array([0.7, 0.3]), np.array([1.0, 0.1]))
+    sweep = Sweep(omega, *generalised_maxwell.moduli(fluid, omega))
+    fit = models.fluid(sweep, generalised_maxwell.spectrum(sweep))
+    fit.details[INTERVAL] = {"low": 0.0, "high": 1.96, "wider_than_standard_error": False}
+    told = instrument.compression_numbers(fit, simulation)
+    one_Pa = compression.smooth_force(law, STRAIN, 0.01) / float(law.shear_modulus())
+    assert told["axial_force_N"] == 0 and told["axial_force_total_error_N"] == pytest.approx(one_Pa)
+    assert told["axial_force_at_once_N"] == pytest.approx(1000 * one_Pa, rel=1e-6)
+    G = 300 * (1j * omega) ** 0.3
+    springpot = models.fractional(Sweep(omega, G.real, G.imag))[0]
+    told = instrument.compression_numbers(springpot, simulation)
+    assert told["axial_force_N"] == 0 and told["axial_force_at_once_N"] is None
+    springpot.details["precompression"] = told
+    assert sweep_report._compression([springpot])[1].endswith(": 0 N (smooth plates)")
 
 
 def test_the_inertia_of_a_compressed_sample_is_that_of_its_mass(tmp_path, law):

@@ -1,6 +1,7 @@
 """Springpot models of relaxation and creep tests and of several tests, against inverse Laplace transforms by mpmath."""
 
 import json
+import math
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from fitting.fits.families import springpots_in_time
 from fitting.methods import generalised_maxwell, springpots, time_response
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers import time_tests
+from fitting.readers.frequency_sweep import Sweep
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -98,6 +100,23 @@ def test_creep_gives_them_too(tmp_path):
     found = {f.kind.name: f for f in springpots_in_time.fractional_in_time(test, near)}
     own = found["fractional_kelvin_voigt"].parameters
     assert np.allclose(own.values, TRUTHS["fractional_kelvin_voigt"], rtol=3e-3)
+
+
+def test_other_models_of_several_tests_have_the_warnings_of_prony_modes():
+    """The rows of the creep test begin under load, and the sweep has noise of 8 %. Both were told for Prony modes
+    only.
+    """
+    rng, omega = np.random.default_rng(0), np.geomspace(0.3, 100, 16)
+    G = 300 * (1j * omega) ** 0.3
+    noise = 1 + 0.08 * rng.standard_normal((2, 16))
+    sweep = Sweep(omega, G.real * noise[0], G.imag * noise[1], source="sweep.csv")
+    time = np.append(0.0, np.geomspace(0.05, 50, 16))
+    strain = time**0.3 / (300 * math.gamma(1.3)) * (1 + 0.01 * rng.standard_normal(17))
+    creep = time_tests.TimeTest("creep", time, np.append(0.0, np.ones(16)), strain, time > 0, source="creep.csv")
+    fit = springpots_in_time.choose_together([sweep, creep], "spectrum", 2)
+    assert fit.kind.name == "spectrum"
+    assert any("no row of creep.csv shows how the load changed between 0 and 0.05 s" in w for w in fit.warnings)
+    assert any(w.startswith("the fit misses the data of sweep.csv by") for w in fit.warnings)
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ from fitting.fits import simulated_rheometer, viscoelastic
 from fitting.fits.families import models
 from fitting.fits.honesty import total_error
 from fitting.fits.honesty.edges import HALF_DECADE
+from fitting.fits.honesty.long_times import INTERVAL, NORMAL
 from fitting.fits.viscoelastic import Fit, Kind
 from fitting.methods import as_prony_modes, generalised_maxwell, host, uncertainty
 from fitting.methods.estimate import Estimate, wider
@@ -449,14 +450,15 @@ def _of_own_moduli(kind: Kind, fit: Fit, sweep: Sweep) -> tuple[Kind, dict[str, 
 
 
 def compression_numbers(fit: Fit, simulation: simulated_rheometer.Simulation) -> dict[str, object]:
-    """Return the entry `precompression` of fit.json, for a fit in closed form or through the simulation."""
+    """Return the entry `precompression` of fit.json, for a fit in closed form or through the simulation. The forces
+    belong to the fitted model, not to its Prony modes. If its instantaneous modulus is infinite, the force at once is
+    None."""
     law, strain = laws.typical(simulation.law), simulation.precompression
     G, glued = float(np.asarray(law.shear_modulus())), fit.method != "closed-form"
     factors, kept = compression.shares(law, strain), compression.incompressible(law, strain)
     force = fit.details["force_of_law_N"] if glued else compression.smooth_force(law, strain, simulation.radius)
-    G0, rest = float(fit.model.shear_modulus), float(fit.model.equilibrium_modulus)
-    noise = force * uncertainty.equilibrium_error(fit.uncertainty) / G
-    of_modulus = force * total_error.total_errors(fit).get("equilibrium_modulus", 0.0) / G
+    moduli, (noise, total) = models.limiting_moduli(fit), _equilibrium_errors(fit)
+    rest, at_once = moduli["equilibrium_modulus"], moduli.get("shear_modulus")
     of_mesh = fit.details.get("force_of_law_mesh_bias_N", 0.0) * rest / G
     return {
         "strain": strain,
@@ -468,15 +470,27 @@ def compression_numbers(fit: Fit, simulation: simulated_rheometer.Simulation) ->
         "smooth_factor_of_relaxing_moduli": factors.relaxing,
         "smooth_factor_of_equilibrium_modulus": factors.equilibrium,
         "axial_force_N": force * rest / G,
-        "axial_force_standard_error_N": noise,
+        "axial_force_standard_error_N": None if noise is None else force * noise / G,
         "axial_force_mesh_bias_N": of_mesh,
-        "axial_force_total_error_N": float(np.hypot(of_modulus, of_mesh)),
-        "axial_force_at_once_N": force * G0 / G,
+        "axial_force_total_error_N": None if total is None else float(np.hypot(force * total / G, of_mesh)),
+        "axial_force_at_once_N": None if at_once is None else force * at_once / G,
     }
+
+
+def _equilibrium_errors(fit: Fit) -> tuple[float | None, float | None]:
+    """Return the standard error and the total error [Pa] of the equilibrium modulus; None: unknown. The total error of
+    a fluid is the upper end of the 95 % interval, converted to a standard deviation."""
+    total, interval = total_error.total_errors(fit).get("equilibrium_modulus"), fit.details.get(INTERVAL)
+    if total is None:
+        return None, interval["high"] / NORMAL if interval else None
+    if fit.parameters is None:
+        return uncertainty.equilibrium_error(fit.uncertainty), total
+    return float(fit.parameters.standard_errors[fit.kind.names.index("equilibrium_modulus")]), total
 
 
 def _changed(fit: Fit, before: compression.Shares, after: compression.Shares) -> float:
     """Return G0 computed with the factors `after`, divided by G0 computed with the factors `before`, for the same
-    measured moduli."""
-    stands = float(fit.model.equilibrium_modulus) / float(fit.model.shear_modulus)
+    measured moduli. If the model has no finite G0, the result is valid for G0 of the Prony modes."""
+    moduli = {"shear_modulus": float(fit.model.shear_modulus)} | models.limiting_moduli(fit)
+    stands = moduli["equilibrium_modulus"] / moduli["shear_modulus"]
     return (1 - stands) * before.relaxing / after.relaxing + stands * before.equilibrium / after.equilibrium

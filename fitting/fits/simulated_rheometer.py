@@ -294,7 +294,7 @@ def through_torsion(
     at = BestPoint("torsion", found, storage, loss, advice)
     fit = fit_at(sweep, at, kind, (running, compiling + pressing), details)
     if simulation.is_linear and kind.prior is None:
-        fit = fit._replace(uncertainty=_with_biases(fit, (rig, law, data[2], scales), simulation))
+        fit = _with_biases(fit, (rig, law, data[2], scales), simulation)
     return _as_told_before(with_alike_points(fit, sweep) if INDEPENDENT in start.details else fit, start)
 
 
@@ -316,8 +316,8 @@ def _with_shared_errors(fit: Fit, start: Fit) -> Fit:
     return fit._replace(uncertainty=with_shared_errors(fit.uncertainty, start.uncertainty), parameters=own)
 
 
-def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:
-    """Return the estimate with the changes of the parameters due to the mesh and due to the time steps, to first order.
+def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Fit:
+    """Return the fit with the changes of the parameters due to the mesh and due to the time steps, to first order.
 
     At small strain, both changes follow from two sets of moduli without the error of a mesh: one for the recursion, and
     one for continuous time. For a compressed sample, these moduli are computed with quadratic elements, and an estimate
@@ -334,14 +334,18 @@ def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:
         rate, inertia = np.asarray(omega), simulation.inertia
         exact = sample_inertia.shown(exact, rate, *inertia)
         meshless = sample_inertia.shown(meshless, sample_inertia.rate_in_steps(rate, simulation.steps), *inertia)
-    natural_of = partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell)
 
-    def moved(missing: np.ndarray) -> np.ndarray:
-        return mesh_bias(fit.solution, natural_of, np.concatenate([missing.real, missing.imag]) / scales)
+    def told(estimate: Estimate, natural_of: Callable) -> Estimate:
+        def moved(missing: np.ndarray) -> np.ndarray:
+            return mesh_bias(fit.solution, natural_of, np.concatenate([missing.real, missing.imag]) / scales)
 
-    return fit.uncertainty._replace(
-        mesh_bias=moved(meshless - (fit.storage + 1j * fit.loss)), time_step_bias=moved(exact - meshless)
-    )
+        of_mesh = moved(meshless - (fit.storage + 1j * fit.loss))
+        return estimate._replace(mesh_bias=of_mesh, time_step_bias=moved(exact - meshless))
+
+    own, values = fit.parameters, fit.kind.values
+    own = own if own is None or values is None else told(own, values)
+    of_modes = told(fit.uncertainty, partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell))
+    return fit._replace(uncertainty=of_modes, parameters=own)
 
 
 def _of_no_mesh(law: laws.Law, prony: Prony, omega: jax.Array, steps: int) -> tuple[jax.Array, jax.Array]:
@@ -403,10 +407,18 @@ def largest_shift(closed: Fit, simulated: Fit) -> float:
     return float(np.max(shift[known] / np.maximum(errors[known], 1e-300), initial=0.0))
 
 
+def _seen_by_user(fit: Fit) -> Estimate:
+    """Return the parameters in which the simulation is compared with the closed form: those of a springpot model, or
+    those of the Prony modes."""
+    return fit.uncertainty if fit.parameters is None or fit.kind.effective is not None else fit.parameters
+
+
 def _with_equilibrium(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """Return the parameters of the modes followed by the equilibrium modulus, and the standard errors of all of
-    these."""
-    u = fit.uncertainty
+    """Return the parameters of a springpot model, or the parameters of the modes followed by the equilibrium modulus,
+    and the standard errors of all of these."""
+    u = _seen_by_user(fit)
+    if u is not fit.uncertainty:
+        return u.values, u.standard_errors
     rest = u.values[0] * (1 - u.values[1 : 1 + (len(u.values) - 1) // 2].sum())
     return np.append(u.values, rest), np.append(u.standard_errors, uncertainty.equilibrium_error(u))
 
@@ -414,9 +426,8 @@ def _with_equilibrium(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
 def _bias(closed: Fit, simulated: Fit) -> list[str]:
     """Return a warning, with the cause, for each parameter that differs between simulation and closed form by more than
     its standard error."""
-    shift = simulated.uncertainty.values - closed.uncertainty.values
-    errors, out = simulated.uncertainty.standard_errors, []
-    each = zip(simulated.uncertainty.names, shift, errors, closed.uncertainty.values, strict=True)
+    before, after, out = _seen_by_user(closed), _seen_by_user(simulated), []
+    each = zip(after.names, after.values - before.values, after.standard_errors, before.values, strict=True)
     for k, (name, d, e, v) in enumerate(each):
         if abs(d) > e and abs(d) > 1e-6 * abs(v):
             cause, remedy = _cause(closed, simulated, k)
@@ -441,7 +452,7 @@ def _cause(closed: Fit, simulated: Fit, k: int) -> tuple[str, str]:
             "the glued plates, which prevent the sample from widening, change",
             "for smooth plates use --method closed-form",
         )
-    of_mesh, of_steps = simulated.uncertainty.mesh_bias, simulated.uncertainty.time_step_bias
+    of_mesh, of_steps = _seen_by_user(simulated).mesh_bias, _seen_by_user(simulated).time_step_bias
     if of_mesh is not None and of_steps is not None and abs(of_mesh[k]) > abs(of_steps[k]):
         return "the mesh of the simulation changes", "use the closed form (--method closed-form)"
     return "the simulation's discretisation changes", "raise --steps, or use the closed form (--method closed-form)"

@@ -358,7 +358,7 @@ def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) ->
     out += structured(chosen)
     out += uncertainty.superfluous(band, chosen.uncertainty)
     out += _of_better_fits(chosen, tried)
-    out += _of_rises(chosen)
+    out += of_rises(chosen)
     if chosen.kind.name == "prony":
         out += uncertainty.like_a_fluid(chosen.uncertainty, "measure longer, or at lower frequencies")
     low, high = band.resolved
@@ -400,7 +400,7 @@ BETTER = 4.0
 _SHORT = 0.2
 
 
-def _of_rises(chosen: Together) -> list[str]:
+def of_rises(chosen: Together) -> list[str]:
     """Return a warning for each relaxation or creep test whose load changes between two rows of the file, if modes
     relax during this time. Only the first such change of a test is considered."""
     own = chosen.model.relaxation_times[np.asarray(chosen.model.ratios) > 0.01]

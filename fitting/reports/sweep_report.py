@@ -473,9 +473,8 @@ def _compression(fits: list[Fit]) -> list[str]:
     found = [fit.details["precompression"] for fit in fits if "precompression" in fit.details]
     if not found:
         return []
-    forces = ", ".join(
-        f"{f['axial_force_N']:.3g} ± {f['axial_force_total_error_N']:.2g} N ({f['plates']} plates)" for f in found
-    )
+    each = ((f["axial_force_N"], f["axial_force_total_error_N"], f["plates"]) for f in found)
+    forces = ", ".join(f"{F:.3g}{'' if e is None else f' ± {e:.2g}'} N ({plates} plates)" for F, e, plates in each)
     one = found[0]
     kept = one["modulus_if_incompressible"]
     if_kept = "" if kept is None else f"; smooth plates: G0 is {kept:.4g} times as large if the volume is kept"

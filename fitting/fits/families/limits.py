@@ -69,7 +69,9 @@ def limit_sentences(name: str, modes: Estimate, model: Maxwell, own: Estimate | 
     return out
 
 
-def still_relaxing(storage: np.ndarray, noise: float, longest: float) -> list[str]:
+def still_relaxing(
+    storage: np.ndarray, noise: float, longest: float, remedy: str = "measure at lower frequencies"
+) -> list[str]:
     """Return a warning if G' still decreases at the lowest frequencies. Then the material may relax more at lower
     frequencies.
 
@@ -77,6 +79,7 @@ def still_relaxing(storage: np.ndarray, noise: float, longest: float) -> list[st
         storage: G' (3,) of the model [Pa] at the lowest frequency, half a decade above it and one decade above it.
         noise: relative noise of the data.
         longest: longest relaxation time [s] of the model.
+        remedy: what the user can do, for the end of the warning.
     """
     fall, next_fall = np.diff(storage)
     if fall <= max(TOLD * noise * storage[0], SLOWING * next_fall):
@@ -85,5 +88,5 @@ def still_relaxing(storage: np.ndarray, noise: float, longest: float) -> list[st
         f"G' falls by {100 * fall / storage[1]:.2g} % in the lowest half decade and by "
         f"{100 * next_fall / storage[2]:.2g} % in the next half decade. The equilibrium modulus is the modulus after "
         f"{longest:.3g} s, the longest relaxation time of the model. It is unknown how much of this modulus relaxes "
-        "later. The stated error does not contain this part: measure at lower frequencies"
+        f"later. The stated error does not contain this part: {remedy}"
     ]

@@ -151,6 +151,14 @@ def _has_spring(own: Estimate | None) -> bool:
     return own is not None and bool(np.any(_bounded(own) & (own.values < 0.5)))
 
 
+def limiting_moduli(fit: Fit) -> dict[str, float]:
+    """Return the moduli [Pa] of the fitted model at frequency 0 (0 for a fluid) and at infinite frequency. An infinite
+    modulus is not included. If a springpot is a spring, the result contains the moduli of the Prony modes."""
+    if fit.parameters is None or _has_spring(fit.parameters):
+        return limits.of_the_modes(fit.model)
+    return {"equilibrium_modulus": 0.0} | limits.of_the_model(fit.parameters)
+
+
 def _cut_off(fit: Fit) -> str:
     return (
         f"the model {fit.kind.name} has no finite instantaneous modulus: shear_modulus belongs to the {fit.modes} "

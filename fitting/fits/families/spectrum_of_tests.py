@@ -21,6 +21,7 @@ from fitting.methods.estimate import Estimate, estimated
 from fitting.methods.generalised_maxwell import Maxwell, non_negative
 from fitting.methods.least_squares import Solution
 from fitting.methods.relaxation_spectrum import GridOfTimes, GridSpectrum
+from fitting.readers.frequency_sweep import Sweep
 from fitting.readers.time_tests import TimeTest
 from liverjax.core.struct import Content
 from liverjax.solvers.blas import one_blas_thread
@@ -184,6 +185,19 @@ def _as_a_fit(
     return SpectrumFit(kind, model, solution, spread, own, details, tuple(sentences))
 
 
+def _still_relaxing(tests: Sequence[Measured], told: GridSpectrum, noises: np.ndarray) -> tuple[str, ...]:
+    """Return a warning if G' of the spectrum still decreases at the lowest frequency that the tests resolve. `noises`:
+    noise of each test, relative to its scales."""
+    longest = int(np.argmax([t.resolved[1] for t in tests]))
+    lowest = 1 / tests[longest].resolved[1] * np.sqrt(10.0) ** np.arange(3)
+    columns = generalised_maxwell.mode_columns(lowest, told.times)[:3, 1:]
+    storage, slowest = told.equilibrium + columns @ told.strengths, float(np.max(told.times, initial=0.0))
+    sweeps = any(isinstance(t, Sweep) for t in tests)
+    remedy = "measure longer, or at lower frequencies" if sweeps else "measure longer"
+    found = limits.still_relaxing(storage, float(noises[longest]), slowest, remedy)
+    return tuple(found) if told.equilibrium > 0 else ()
+
+
 def spectrum_in_time(test: TimeTest, near: Maxwell) -> TimeFit:
     """Fit a smooth spectrum to a relaxation or creep test. `near`: Prony modes with about the same moduli as the
     test."""
@@ -192,7 +206,8 @@ def spectrum_in_time(test: TimeTest, near: Maxwell) -> TimeFit:
     _, answer, scales = together.reported_numbers(test)
     where = (test.time[time_tests.thinned(test)], answer, found.r * scales + answer, scales)
     own = (fit.kind, fit.model, fit.solution, fit.spread, found.converged)
-    return TimeFit(*own, *where, fit.sentences, 0.0, 0.0, fit.details, fit.own, test.rounding)
+    sentences = (*fit.sentences, *_still_relaxing([test], told, np.array([fit.spread.noise])))
+    return TimeFit(*own, *where, sentences, 0.0, 0.0, fit.details, fit.own, test.rounding)
 
 
 def spectrum_together(tests: list[Measured], near: Maxwell, noise: np.ndarray) -> Together:
@@ -206,7 +221,8 @@ def spectrum_together(tests: list[Measured], near: Maxwell, noise: np.ndarray) -
     shares, fitted = together.misfits(tests, data, found.r, noise, told.effective)
     fit = _as_a_fit(tests, grid, found, told, lambda whole: together.over_own_noise(whole, shares, used / noise))
     own = (tests, fit.kind, fit.model, fit.solution, fit.spread, found.converged)
-    first = Together(*own, shares, fitted, [], fit.sentences, 0.0, 0.0, fit.own, fit.details)
+    sentences = (*fit.sentences, *_still_relaxing(tests, told, noise))
+    first = Together(*own, shares, fitted, [], sentences, 0.0, 0.0, fit.own, fit.details)
     kinds = list(map(together.name_of, tests))
 
     def alone(k: int) -> np.ndarray:

@@ -326,6 +326,8 @@ def _best_of_models(tests: list[Measured], model: str, prony: Together, progress
         best = best._replace(shares=_shares_of_springpots(best))
     out = [*best.warnings] if best.converged else ["the fit did not converge: try another --model", *best.warnings]
     out += together.disagreements(best.shares, "try another --model")
+    out += together.missed(best.shares)
+    out += together.of_rises(prony)  # its relaxation times show whether the material relaxes during the rise
     out += together.structured(best)
     out += models.undetermined(best)
     return best._replace(tried=rows, warnings=tuple(out), **seconds)

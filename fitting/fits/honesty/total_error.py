@@ -63,9 +63,10 @@ def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
             # parameter is used as the error.
             own = max(abs(known[name][0]), noise[name])
             out["band"][name] = max(out["band"][name], float(own if beyond > edges.RUNS_AWAY * own else beyond))
-    for source, moved in (("mesh", fit.uncertainty.mesh_bias), ("time_step", fit.uncertainty.time_step_bias)):
-        if moved is not None and fit.parameters is None:
-            out[source] = _of_modes(fit, moved)
+    shown = fit.parameters or fit.uncertainty
+    for source, moved in (("mesh", shown.mesh_bias), ("time_step", shown.time_step_bias)):
+        if moved is not None:
+            out[source] = _of_bias(fit, moved)
     interval = fit.details.get(INTERVAL)
     if interval and interval["wider_than_standard_error"] and "equilibrium_modulus" in known:
         out["long_times"] = dict.fromkeys(known, 0.0) | {"equilibrium_modulus": interval["beyond_standard_error"]}
@@ -86,9 +87,12 @@ def root_of_squares(shares: dict[str, dict[str, float]]) -> dict[str, float]:
     return {name: float(np.sqrt(sum(part[name] ** 2 for part in shares.values()))) for name in shares["noise"]}
 
 
-def _of_modes(fit: Fit | TimeFit, moved: np.ndarray) -> dict[str, float]:
-    """Return the absolute change of each parameter, by name. `moved` (P,): changes of G0, ratios and relaxation times.
-    The change of the equilibrium modulus is computed from these changes."""
-    out = {name: abs(float(d)) for name, d in zip(fit.uncertainty.names, moved, strict=True)}
-    out["equilibrium_modulus"] = abs(float(equilibrium_change(fit.uncertainty.values, moved)))
+def _of_bias(fit: Fit | TimeFit, moved: np.ndarray) -> dict[str, float]:
+    """Return the absolute change of each parameter, by name. `moved` (P,): changes of the parameters of the model, or
+    of G0, ratios and relaxation times of Prony modes. The change of the equilibrium modulus of Prony modes is computed
+    from these changes."""
+    names = (fit.parameters or fit.uncertainty).names
+    out = {name: abs(float(d)) for name, d in zip(names, moved, strict=True)}
+    if fit.parameters is None:
+        out["equilibrium_modulus"] = abs(float(equilibrium_change(fit.uncertainty.values, moved)))
     return {name: out[name] for name in edges.values(fit)}
