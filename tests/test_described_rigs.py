@@ -302,3 +302,17 @@ def test_a_file_that_is_no_toml_gets_one_sentence(tmp_path):
         read_described(tmp_path / "bad.toml")
     with pytest.raises(lj.InputError, match="cannot be read"):
         read_described(tmp_path / "none.toml")
+
+
+def test_columns_of_strain_and_stress_do_not_hide_those_of_the_test(tmp_path):
+    """A file of a testing machine was refused, because it also has columns of strain and stress."""
+    time = np.arange(1.0, 13.0)
+    force = 1e-3 * shear(time)
+    file = written(tmp_path, {"test": "punch", "radius": 0.002, "thickness": 0.004}, (time, 1e-4 + 0 * time, force))
+    expected = read_described(file)
+    rows = "".join(f"{t},0.1,{1e3 * f:.10g},1,{f:.10g}\n" for t, f in zip(time, force, strict=True))
+    head = "Time (s),Extension (mm),Load (mN),Tensile strain (%),Tensile stress (kPa)\n"
+    (tmp_path / "test.csv").write_text(head + rows)
+    found = read_described(file)
+    np.testing.assert_allclose(found.answer, expected.answer, rtol=1e-8)
+    assert not any("tensile" in note for note in found.notes)

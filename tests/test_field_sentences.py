@@ -103,3 +103,15 @@ def test_numbers_that_no_mesh_determines_are_not_blamed_on_the_mesh():
     unknown = found | {"mesh_bias": np.full(2, np.nan)}
     (said,) = bias_sentences(SimpleNamespace(**unknown, standard_errors=np.array([5e3, 5e3])))
     assert said.startswith("the effect of the mesh on the fit is unknown")
+
+
+@pytest.mark.parametrize(("size", "title"), [(10e-6, "x = 0.00050 cm"), (0.1, "x = 5.0 cm")])
+def test_the_places_of_sections_have_the_digits_of_the_body(size, title):
+    """The figure of a body of 10 um was named "x = 0.0 cm"."""
+    mesh = lj.shapes.box((size, size, size), (2, 2, 2))
+    middle = np.all(np.isclose(mesh.points, size / 2), axis=1)
+    found = SimpleNamespace(
+        name="mu", log_factor=1.0 * middle, sd=np.ones(27), given=np.zeros(len(mesh.tetrahedra), bool)
+    )
+    figure = field_report.map_figure(mesh, found)
+    assert figure.axes[0].get_title() == title

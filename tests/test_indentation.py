@@ -439,3 +439,15 @@ def test_only_a_real_hold_at_the_end_is_left_out(noise):
     creeping, constant = np.append(depth, 6e-4 + 2e-6 * np.arange(60)), np.append(force, np.full(60, 0.03))
     last, told = _end_of_loading(creeping, constant + noise * 0.03 * rng.standard_normal(260))
     assert (noise > 0.1 and not told) or 190 <= last <= 205
+
+
+@pytest.mark.parametrize("second", [["[step]", "notes", "see page 12"], ["[step]", "Sheet2", ""]])
+def test_other_sheets_of_a_workbook_are_not_read_as_rows(second, tmp_path):
+    """A workbook is read as such a text. The second sheet made the file unreadable, even if it was empty."""
+    rows = [f"{d}\t{f}" for d, f in zip(DEPTH, hertz(DEPTH), strict=True)]
+    (tmp_path / "one.txt").write_text("\n".join(["[step]", "curve", "depth_m\tforce_N", *rows, ""]))
+    (tmp_path / "two.txt").write_text("\n".join(["[step]", "curve", "depth_m\tforce_N", *rows, "", *second]))
+    one, two = read_indentation(tmp_path / "one.txt"), read_indentation(tmp_path / "two.txt")
+    assert np.array_equal(one.force, two.force)
+    told = ("only the first table is read, not the sheets or steps below it: 'notes'",) if second[-1] else ()
+    assert two.notes == (*told, *one.notes)

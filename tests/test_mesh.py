@@ -272,13 +272,17 @@ def test_copies_other_cells_and_millimetres_are_told(tmp_path):
 
 def test_a_bound_in_millimetres_is_told():
     """This bound would exclude nothing and select the whole mesh. A bound far outside is a common way to select
-    everything.
+    everything. A bound of 0.5 in a small body was not told.
     """
     mesh = lj.shapes.box((0.1, 0.1, 0.1), (2, 2, 2))
     with pytest.warns(UserWarning, match=r"where: z_max = 50 m excludes no node.*write 0.05 if you meant mm"):
         assert len(lj.boundary.select(mesh, {"z_max": 50})) == 27
     for where in ({"z_min": -1.0}, {"z_max": 1e3}, {"x_max": 0.2}):
         assert len(lj.boundary.select(mesh, where)) == 27
+    small = lj.shapes.box((0.004, 0.004, 0.004), (2, 2, 2))
+    with pytest.warns(UserWarning, match=r"where: z_max = 0.5 m excludes no node.*write 0.0005 if you meant mm"):
+        assert len(lj.boundary.select(small, {"z_max": 0.5})) == 27
+    assert len(lj.boundary.select(small, {"z_max": 0.005, "y_max": 1.0})) == 27
 
 
 @pytest.mark.parametrize("top", [[0.2, 0.2, 2.0], [0.2, 0.2, 0.5]], ids=["around", "inside"])

@@ -237,3 +237,30 @@ def test_quoted_headings_may_have_line_breaks(tmp_path):
     with pytest.raises(InputError, match=r"line 7: G' +.Pa. = 'x' is not a number"):
         read_sweep(path)
     assert list(read_sweep(_write(tmp_path, text.replace("x", "1500"))).storage) == [1000, 1200, 1500]
+
+
+@pytest.mark.parametrize("remark", [["gap readjusted here"], ["n/a", "n/a", "n/a"]])
+@pytest.mark.parametrize("ending", ["tsv", "xlsx"])
+def test_rows_below_a_remark_are_read(ending, remark, tmp_path):
+    """With tabs between the cells, all rows below the remark were lost without a note."""
+    rows = [[0.1 * 2**k, 300.5 + k, 30.25 + k] for k in range(10)]
+    every = [["frequency_Hz", "storage_modulus_Pa", "loss_modulus_Pa"], *rows[:5], remark, *rows[5:]]
+    path = tmp_path / f"t.{ending}"
+    if ending == "xlsx":
+        _workbook(path, {"Sweep": every, "Notes": [["see page 12"], ["Strain", "Force"], [1.0, 2.0, 3.0]]})
+    else:
+        path.write_text("\n".join("\t".join(map(str, row)) for row in every) + "\n")
+    found = read_sweep(path)
+    assert found.storage.tolist() == [row[1] for row in rows]
+    assert any(f"{' '.join(remark)!r}, has no numbers and is ignored" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("title", ["", "Temperature sweep\n"])
+def test_another_table_below_is_not_appended(title, tmp_path):
+    """Numbers of a temperature ramp are not frequencies."""
+    head, rows = "Frequency [Hz]\tG' [Pa]\tG'' [Pa]\n", "".join(f"{k}\t{300 + k}\t30\n" for k in range(1, 7))
+    path = _write(tmp_path, head + rows + title + head.replace("Frequency [Hz]", "Temperature [K]") + rows, "t.txt")
+    found = read_sweep(path)
+    assert len(found.storage) == 6
+    told = any("Temperature [K]" in note and "the rows below it are not read" in note for note in found.notes)
+    assert told == (not title)

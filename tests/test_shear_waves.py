@@ -241,3 +241,13 @@ def test_copies_of_all_rows_are_left_out(tmp_path):
         found = dispersion.read_dispersion(tmp_path / "w.csv", 1000.0)
         assert len(found.velocity) == number
         assert len(found.notes) == (text == 2 * rows) and all("4 of 8 rows are ignored" in n for n in found.notes)
+
+
+def test_a_second_sheet_is_not_read_as_rows_of_waves(tmp_path):
+    """A workbook is read as such a text. The second sheet made the file unreadable."""
+    rows = "".join(f"{50 * k}\t{1.5 + 0.1 * k}\n" for k in range(1, 6))
+    text = f"[step]\nwaves\nfrequency_Hz\tphase_velocity_m/s\n{rows}\n[step]\nnotes\nsee page 12\n\n[step]\nSheet3\n"
+    (tmp_path / "waves.txt").write_text(text)
+    found = dispersion.read_dispersion(tmp_path / "waves.txt", 1000.0)
+    assert len(found.velocity) == 5
+    assert found.notes == ("only the first table is read, not the sheets or steps below it: 'notes'",)

@@ -183,3 +183,14 @@ def test_a_tensile_test_without_a_whole_row_is_refused(tmp_path):
     (tmp_path / "t.csv").write_text("time_s,tensile strain [1],tensile stress [Pa]\n" + rows)
     with pytest.raises(InputError, match="every row has a cell that is empty or not finite; give numbers"):
         read_columns(tmp_path / "t.csv")
+
+
+def test_rows_that_are_comments_are_not_read(tmp_path):
+    """The value 9999 at 6 s was fitted. A line of units may also begin with `#`."""
+    rows = [f"{'#' if k == 5 else ''}{k},{k + 1},{9999 if k == 5 else 900 - k}\n" for k in range(10)]
+    (tmp_path / "t.csv").write_text("no,time_s,relaxation_modulus_Pa\n" + "".join(rows))
+    columns, _ = read_columns(tmp_path / "t.csv")
+    assert columns["time"].tolist() == [1, 2, 3, 4, 5, 7, 8, 9, 10] and columns["modulus"].max() == 900
+    (tmp_path / "t.csv").write_text("# no,time,relaxation modulus\n# -,min,kPa\n" + "".join(rows))
+    columns, _ = read_columns(tmp_path / "t.csv")
+    assert columns["time"][0] == 60 and columns["modulus"].max() == 900e3

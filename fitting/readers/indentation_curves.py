@@ -14,6 +14,7 @@ from fitting.readers.tables.text_tables import (
     split_cells,
     text_of,
     to_number,
+    without_later_sheets,
 )
 from fitting.readers.units import INDENTATION_UNITS
 from liverjax.core.errors import InputError
@@ -63,9 +64,10 @@ def read_indentation(path: str | Path) -> IndentationCurve:
         unknown = next((words for words in map(_told_of_unknown_unit, lines) if words), None)
         missing = "no header names depth and force with units; write depth_mm,force_mN above the rows"
         raise InputError(f"{path}: {unknown or missing}")
+    lines, unread = without_later_sheets(lines, head)
     found, delimiter = _depth_and_force(lines, head), _delimiter_of(lines, head)
     columns, notes = _in_si_units(str(path), lines, head, delimiter, found)
-    notes = [*_told_of_others(lines, head, found), *notes]
+    notes = [*unread, *_told_of_others(lines, head, found), *notes]
     depth, force = columns["depth"], columns["force"]
     if not len(depth):
         raise InputError(

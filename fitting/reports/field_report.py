@@ -188,6 +188,8 @@ def map_figure(mesh: TetMesh, found: Field) -> "Figure":
     factor, sd = (np.where(shown, values, np.nan) for values in (np.exp(found.log_factor), found.sd))
     middle = np.asarray(mesh.points)[np.nanargmax(np.abs(np.log(factor) - np.nanmedian(np.log(factor))))]
     figure, axes = pyplot().subplots(2, 3, figsize=(11, 5.5), layout="constrained")
+    # The digits of a place [cm] are three or more of the size of the body.
+    digits = max(1, 2 - int(np.floor(np.log10(100 * np.ptp(mesh.points, axis=0).max()))))
     rows = (
         (factor, f"{found.name} over the scene's [1]", "viridis"),
         (sd, "standard deviation of its logarithm", "magma"),
@@ -199,7 +201,8 @@ def map_figure(mesh: TetMesh, found: Field) -> "Figure":
                 plane, origin="lower", extent=extent, cmap=colours, vmin=np.nanmin(values), vmax=np.nanmax(values)
             )
             a, b = (name for k, name in enumerate("xyz") if k != axis)
-            row[axis].set(xlabel=f"{a} [cm]", ylabel=f"{b} [cm]", title=f"{'xyz'[axis]} = {100 * middle[axis]:.1f} cm")
+            place = f"{'xyz'[axis]} = {100 * middle[axis]:.{digits}f} cm"
+            row[axis].set(xlabel=f"{a} [cm]", ylabel=f"{b} [cm]", title=place)
         figure.colorbar(drawn, ax=row, label=label)
     return figure
 

@@ -98,8 +98,9 @@ def read_described(path: str | Path) -> TimeTest:
     """
     path = Path(path)
     described = _description(path)
-    columns, notes = read_columns(described.data)
-    for name in ("displacement", "force"):
+    needed = ("displacement", "force")
+    columns, notes = read_columns(described.data, needed)
+    for name in needed:
         if name not in columns:
             raise InputError(
                 f"{described.data}: the test in {path.name} needs columns of time, displacement and force; this file "

@@ -10,7 +10,13 @@ import numpy as np
 import scipy.special
 
 from fitting.readers.frequency_sweep import distances_from_polynomials, merged, smooth_curve
-from fitting.readers.tables.text_tables import split_line, text_of, to_number, without_multiples
+from fitting.readers.tables.text_tables import (
+    split_line,
+    text_of,
+    to_number,
+    without_later_sheets,
+    without_multiples,
+)
 from fitting.readers.units import WAVE_UNITS
 from fitting.waves.shear_waves import DENSITY
 from liverjax.core.errors import InputError
@@ -102,6 +108,8 @@ def read_dispersion(path: str | os.PathLike, density: float | None = None) -> Di
     notes = (
         [] if density is not None else [f"a density of {DENSITY:g} kg/m^3 is assumed: change this value with --density"]
     )
+    lines, unread = without_later_sheets(lines, header[0])
+    notes += unread
     columns = _columns(str(path), lines, header)
     rows = np.column_stack(list(columns.values()))
     kept = without_multiples([tuple(row) for row in rows.tolist()])

@@ -12,6 +12,8 @@ from liverjax.core.struct import Indices
 from liverjax.mesh.tetrahedra import FACES, TetMesh
 
 AXES = "xyz"
+#: A bound may be in millimetres if it is larger than this multiple of the largest coordinate of the mesh.
+FAR_OUTSIDE = 10.0
 
 
 def select(
@@ -64,10 +66,12 @@ def select(
 
 
 def _warn_of_millimetres(x: np.ndarray, key: str, bound: float, name: str) -> None:
-    """Warn if a bound excludes no node, but would lie within the mesh if it were in millimetres."""
+    """Warn if a bound excludes no node and is far outside of the mesh, but would lie within it if it were in
+    millimetres. There is no warning of 1 m, with which people select everything."""
     low, high = x.min(), x.max()
     idle = bound > high if key.endswith("max") else bound < low
-    if idle and abs(bound) > 1 and low < 1e-3 * bound < high:
+    far = abs(bound) > FAR_OUTSIDE * max(abs(low), abs(high)) and abs(bound) != 1
+    if idle and far and low < 1e-3 * bound < high:
         warnings.warn(
             f"{name}: {key} = {bound:g} m excludes no node, since the mesh spans {low:.4g} to {high:.4g} m. Bounds are "
             f"in metres; write {1e-3 * bound:g} if you meant mm",

@@ -21,6 +21,7 @@ from fitting.readers.tables.sweep_columns import (
 )
 from fitting.readers.tables.sweep_headings import DEVIATION_WORDS
 from fitting.readers.tables.text_tables import (
+    EMPTY,
     decimal_sign,
     delimiter_of_header,
     find_delimiter,
@@ -259,7 +260,7 @@ def _rows_below(path, columns, lines, k, delimiter, width):
     """Return the rows of numbers below a header, their line numbers, and the index of the line after them. An empty
     cell is NaN."""
     needed = [c for c in columns if not c.quantity.endswith("_sd")]
-    every, numbers = [], []
+    every, numbers, notes = [], [], []
     while k < len(lines):
         line = lines[k]
         if line.lstrip().startswith(COMMENTS) or not line.strip(f"{delimiter} \t-=+:"):
@@ -269,9 +270,16 @@ def _rows_below(path, columns, lines, k, delimiter, width):
             continue
         cells = split_cells(line, delimiter)
         words = _is_words(cells, needed)
+        if words and every and delimiter == "\t" and _is_remark(lines, k, needed):
+            k += 1
+            notes.append(f"line {k}, {_line_shown(line)}, has no numbers and is ignored")
+            continue
         if words and (
             not every or line.startswith("[") or delimiter == "\t" or not _goes_on(lines, k, delimiter, needed)
         ):
+            below = "".join(lines[k + 1 : k + 2])
+            if every and delimiter == "\t" and not _complete(line) and _has_all_numbers(below, needed):
+                notes.append(f"line {k + 1}, {_line_shown(line)}, has no numbers, and the rows below it are not read")
             break  # the header was only a title, or this table ends
         k += 1
         if len([c for c in cells if c]) > width:
@@ -281,7 +289,7 @@ def _rows_below(path, columns, lines, k, delimiter, width):
         every.append(cells)
         numbers.append(k)
     summaries = summary_rows(every)
-    notes = [f"line {numbers[j]} is a summary of other rows ({word}) and is ignored" for j, word in summaries.items()]
+    notes += [f"line {numbers[j]} is a summary of other rows ({word}) and is ignored" for j, word in summaries.items()]
     every, numbers = ([v for j, v in enumerate(a) if j not in summaries] for a in (every, numbers))
     kept = [[cells[c.place] if c.place < len(cells) else "" for c in columns] for cells in every]
     return _numbers_of_cells(path, columns, kept, numbers, delimiter), numbers, notes, k
@@ -289,6 +297,34 @@ def _rows_below(path, columns, lines, k, delimiter, width):
 
 def _is_words(cells: list[str], needed: list[Column]) -> bool:
     return means_nothing(cells[c.place] for c in needed if c.place < len(cells))
+
+
+def _line_shown(line: str) -> str:
+    return repr(" ".join(line.split())[:40])
+
+
+def _needed_cells(line: str, needed: list[Column]) -> list[str]:
+    """Return the needed cells of a line with tabs between the cells; a cell that is missing is empty."""
+    cells = split_cells(line, "\t")
+    return [cells[c.place] if c.place < len(cells) else "" for c in needed]
+
+
+def _has_all_numbers(line: str, needed: list[Column]) -> bool:
+    """Return whether a line with tabs between the cells has a number in each needed column."""
+    return not any(means_nothing([cell]) for cell in _needed_cells(line, needed))
+
+
+def _is_remark(lines: list[str], k: int, needed: list[Column]) -> bool:
+    """Return whether whole rows of the same table follow below line k, which has no numbers. The cells are separated by
+    tabs. Words in two of the needed columns are headings of another table."""
+    for line in lines[k:]:
+        if _has_all_numbers(line, needed):
+            return True
+        own = _needed_cells(line, needed)
+        headings = means_nothing(own) and sum(cell.lower() not in EMPTY for cell in own) > 1
+        if headings or line.startswith("[") or _complete(line):
+            return False
+    return False
 
 
 def _goes_on(lines: list[str], k: int, delimiter: str, needed: list[Column]) -> bool:

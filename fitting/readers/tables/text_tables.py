@@ -2,6 +2,7 @@
 
 import codecs
 import csv
+import itertools
 import math
 import re
 from collections import Counter
@@ -86,6 +87,17 @@ def _decoded(path: Path, data: bytes) -> str:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
         return data.decode("latin-1")
+
+
+def without_later_sheets(lines: list[str], head: int) -> tuple[list[str], list[str]]:
+    """Return the lines above the next sheet (or step of an instrument) below line `head`, the header of a table. Also
+    return a note with the names of the sheets that are not read; empty sheets are not named."""
+    starts = [k for k in range(head + 1, len(lines)) if lines[k].strip().lower() == "[step]"]
+    parts = [lines[start + 1 : end] for start, end in itertools.pairwise([*starts, len(lines)])]
+    names = [part[0].strip() for part in parts if any(map(str.strip, part[1:]))]
+    listed = ", ".join(map(repr, names))
+    notes = [f"only the first table is read, not the sheets or steps below it: {listed}"] if names else []
+    return lines[: starts[0]] if starts else lines, notes
 
 
 def find_delimiter(line: str) -> str:

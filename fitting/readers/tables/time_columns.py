@@ -129,13 +129,21 @@ LARGE = 1.0
 OWN_TIME = "step time"
 
 
-def read_columns(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], list[str]]:
+def read_columns(
+    path: str | os.PathLike, preferred: tuple[str, ...] = FORMS[0]
+) -> tuple[dict[str, np.ndarray], list[str]]:
     """Return the columns of a test by quantity, in SI units, and notes. The times increase, and begin at 0 s or later.
+
+    Args:
+        path: a file with a header that names the time and one combination of quantities in `FORMS`.
+        preferred: the combination that is read if the file has several. Without it, the first one in `FORMS` is read.
 
     Raises:
         InputError: the file cannot be used; the message names the column or line, the value and the remedy.
     """
-    columns, notes = _columns_in_time(str(path), text_of(Path(path), "a relaxation or creep test").splitlines())
+    columns, notes = _columns_in_time(
+        str(path), text_of(Path(path), "a relaxation or creep test").splitlines(), preferred
+    )
     time = columns["time"]
     if not len(time):
         raise InputError(f"{path}: every row has a cell that is empty or not finite; give numbers")
@@ -155,13 +163,15 @@ def read_columns(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], list[s
     return columns, notes
 
 
-def _columns_in_time(path: str, lines: list[str]) -> tuple[dict[str, np.ndarray], list[str]]:
+def _columns_in_time(
+    path: str, lines: list[str], preferred: tuple[str, ...]
+) -> tuple[dict[str, np.ndarray], list[str]]:
     """Return the columns, in SI units, of the first table that has the time and one of `FORMS`; and notes."""
     for k, line in enumerate(lines):
         delimiter = delimiter_of_header(line.lstrip("# "), _names_a_test)
         cells = split_cells(line.lstrip("# "), delimiter)
         found = _heading(cells)
-        form = next((f for f in FORMS if set(f) <= set(found)), None)
+        form = next((f for f in (preferred, *FORMS) if set(f) <= set(found)), None)
         if "time" in found and form is not None:
             found = {q: found[q] for q in ("time", *form)}  # other columns may have empty cells and other units
             rows, units, left_out = _rows_in_time(path, lines, k + 1, delimiter, found)
@@ -308,7 +318,8 @@ def _known_column(quantity: str, unit: str) -> bool:
 
 
 def _rows_in_time(path, lines, k, delimiter, found):
-    """Return the numbers below the header, the units from a line of units, and notes. An empty cell is NaN."""
+    """Return the numbers below the header, the units from a line of units, and notes. An empty cell is NaN. Below the
+    header, lines that begin with `#` are comments; only a line of units may begin so."""
     kept, numbers, every, units, notes = [], [], [], {}, []
     needed = {q: place for q, (place, _) in found.items()}
     while k < len(lines):
@@ -316,7 +327,7 @@ def _rows_in_time(path, lines, k, delimiter, found):
         k += 1
         _, cells = split_line(line, delimiter)
         own = [cells[p] if p < len(cells) else "" for p in needed.values()]
-        if not means_nothing(own):
+        if not means_nothing(own) and not line.lstrip().startswith("#"):
             kept.append(own)
             every.append(cells)
             numbers.append(k)
@@ -351,6 +362,8 @@ def _rows_follow(below: list[str], delimiter: str, places: list[int]) -> bool:
     for line in below:
         if _begins_a_table(line):
             return False
+        if line.lstrip().startswith("#"):
+            continue
         cells = split_line(line, delimiter)[1]
         if not means_nothing([cells[p] if p < len(cells) else "" for p in places]) and line.strip():
             return True
