@@ -93,7 +93,8 @@ def run(options: argparse.Namespace) -> int:
     )
     field = wave_field.with_noise(field, options.noise)
     writable(options.out, FILES)
-    organ = _organ(options, field)
+    with _forces_that_balance(options.data):
+        organ = _organ(options, field)
     if not options.no_map:
         _check_length_of_map(options.length, organ)
     for note in field.notes:

@@ -50,11 +50,15 @@ class Matrices(NamedTuple):
     pressure: np.ndarray  # lower triangle of g B B^H, stored by diagonals (bandwidth + 1, I)
     balances: int  # number of real equations in chi^2
     parts: tuple[slice, ...]  # rows of C of each part of the body; rows of different parts share no unknowns
+    typical: float  # storage modulus [Pa] to which the size of the pressure term belongs
 
 
-#: FREE: size of the pressure term g B B^H of S, divided by the size of the term C C^H at the modulus `TYPICAL` [Pa].
-#: Since this ratio is finite, the pressure is not quite free; the relative error due to this is about 1 / FREE. The
-#: pressure term is the same for all moduli, so that values of chi^2 for different moduli can be compared.
+#: FREE: size of the pressure term g B B^H of S, divided by the size of the term C C^H at a typical modulus
+#: (`Matrices.typical`). Since this ratio is finite, the pressure is not quite free. The relative error due to this is
+#: about (G / typical modulus)^2 / FREE for the modulus G. In a small stiff region it is larger: 2 % for a cylinder with
+#: a radius of 2.5 voxels that is three times as stiff as its surroundings. The pressure term is the same for all moduli
+#: of a fit, so that values of chi^2 for different moduli can be compared.
+#: TYPICAL: typical modulus [Pa] before the waves are known; `with_typical` changes it.
 FREE, TYPICAL = 1e4, 3000.0
 
 
@@ -97,7 +101,8 @@ class Balanced(NamedTuple):
 
 
 def matrices(body: VoxelBody, density: float) -> Matrices:
-    """Return the matrices of the force balance for a body with this density [kg/m^3]."""
+    """Return the matrices of the force balance for a body with this density [kg/m^3], with the typical modulus
+    `TYPICAL`."""
     scene = lj.Scene(
         mesh=body.mesh,
         law=lj.laws.NeoHookean(mu=1.0, bulk=1.0),
@@ -122,10 +127,16 @@ def matrices(body: VoxelBody, density: float) -> Matrices:
     balances = 2 * (len(inner) - B.shape[1])
     starts = np.flatnonzero(np.diff(body.part[inner // 3], prepend=-1, append=-1))
     parts = tuple(slice(a, b) for a, b in itertools.pairwise(starts))
-    m = Matrices(A.relaxing, A.mass, unknowns, rows, pattern, places, entries, np.zeros((1, 1)), balances, parts)
+    none = np.zeros((1, 1))
+    m = Matrices(A.relaxing, A.mass, unknowns, rows, pattern, places, entries, none, balances, parts, TYPICAL)
     shear = rows_of_balance(m, np.full(rows.shape[-1], TYPICAL + 0j), 0.0)
     B = freely(B, np.abs(shear.data))
     return m._replace(pressure=by_diagonals(B @ B.T))
+
+
+def with_typical(m: Matrices, modulus: float) -> Matrices:
+    """Return the same matrices with a pressure term of the size that belongs to this typical modulus [Pa]."""
+    return m._replace(pressure=m.pressure * (modulus / m.typical) ** 2, typical=modulus)
 
 
 def freely(B: scipy.sparse.csr_array, shear: np.ndarray) -> scipy.sparse.csr_array:
@@ -133,7 +144,7 @@ def freely(B: scipy.sparse.csr_array, shear: np.ndarray) -> scipy.sparse.csr_arr
 
     Args:
         B: nodal forces of pressures of 1 Pa.
-        shear: entries of C at the modulus `TYPICAL`.
+        shear: entries of C at the typical modulus, without the mass.
     """
     part = np.sum(shear**2) / B.shape[0]  # mean diagonal entry of C C^H
     return np.sqrt(FREE * part / B.power(2).sum(axis=1).mean()) * B

@@ -121,7 +121,7 @@ def region_matrices(
     found = []
     for own_parts in parts:
         each = [_renumbered(p, alive, body.mesh.number_of_nodes) for p in own_parts]
-        own_matrices = _all_together([whole, *each], rows, len(s), density)
+        own_matrices = _all_together([whole, *each], rows, len(s), density, m.typical)
         found.append(own_matrices._replace(kinks=3 * len(kinked), patches=patches, patch=patch))
     return found[0] if farther is None else found[0]._replace(farther=found[1])
 
@@ -242,8 +242,11 @@ def _renumbered(p: _CutElements, alive: np.ndarray, nodes: int) -> _CutElements:
     return p._replace(functions=functions)
 
 
-def _all_together(parts: list[_CutElements], rows: np.ndarray, R: int, density: float) -> RegionMatrices:
-    """Return the assembled matrices of all parts. `rows` (U,): row of C for each unknown."""
+def _all_together(
+    parts: list[_CutElements], rows: np.ndarray, R: int, density: float, typical: float
+) -> RegionMatrices:
+    """Return the assembled matrices of all parts. `rows` (U,): row of C for each unknown. `typical` [Pa]: see
+    `Matrices.typical`."""
     I, U = int(rows.max()) + 1, len(rows)
     known, ends, at = _pattern(parts, rows)
     stiffness, mass = np.zeros((R, len(known))), np.zeros(len(known))
@@ -257,7 +260,7 @@ def _all_together(parts: list[_CutElements], rows: np.ndarray, R: int, density: 
     pattern = scipy.sparse.csr_array((np.zeros(len(known)), known % U, ends), shape=(I, U))
     corners = 1 + max((int(p.corners.max()) for p in parts if p.corners.size), default=0)
     B = _pressure_columns(parts, rows, (I, corners * R), corners)
-    forces = balance.freely(B, balance.TYPICAL * stiffness.sum(axis=0))
+    forces = balance.freely(B, typical * stiffness.sum(axis=0))
     return RegionMatrices(
         stiffness, mass, pattern, forces, balance.by_diagonals(forces @ forces.T), 0, NO_PATCHES, np.zeros(0)
     )

@@ -131,7 +131,8 @@ def notes_on_layers(field: WaveField) -> list[str]:
 
 
 def organ_of(field: WaveField, body: VoxelBody, density: float) -> Organ:
-    """Return the measured waves of a field together with the body and its matrices. `density` is in kg/m^3."""
+    """Return the measured waves of a field together with the body and its matrices. `density` is in kg/m^3. The typical
+    modulus of the matrices is a rough modulus of the whole organ."""
     motion = field.displacement[(slice(None), *body.voxel.T)]
     omega = 2 * np.pi * field.frequencies
     waves = MeasuredWaves(omega, motion.reshape(len(omega), -1), np.maximum(field.noise, 1e-9 * np.abs(motion).max()))
@@ -141,7 +142,9 @@ def organ_of(field: WaveField, body: VoxelBody, density: float) -> Organ:
             f"the {len(body.voxel)} measured voxels of the mask give {max(0, m.balances)} equations more than unknown "
             f"pressures. At least {FEWEST_BALANCES} are needed: give a larger mask or a smaller --stride"
         )
-    return Organ(field, body, m, waves, density)
+    length = float(np.ptp(body.mesh.points, axis=0).max())
+    typical = regions.first_modulus(m, waves, density, float(np.min(field.spacing)), length)
+    return Organ(field, body, balance.with_typical(m, typical), waves, density)
 
 
 def regions_of(
@@ -156,7 +159,7 @@ def regions_of(
     m, waves, body = organ.matrices, organ.waves, organ.body
 
     def of_whole() -> Regions:
-        start, uniform = np.array([regions.first_modulus(m, waves)]), _uniform(m, body, organ.density)
+        start, uniform = np.array([m.typical * (1 + regions.LOSS * 1j)]), _uniform(m, body, organ.density)
         return regions.moduli_of_regions(uniform, waves, start, progress, body.voxel)
 
     whole = keep("whole", of_whole)

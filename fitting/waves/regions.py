@@ -1,10 +1,12 @@
 """Find the complex moduli of the regions of an organ from measured waves, with their uncertainty. Each frequency is
 fitted separately."""
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+import scipy.optimize
 import scipy.sparse
 
 from fitting.waves import balance
@@ -12,9 +14,11 @@ from fitting.waves.balance import Balanced, Matrices
 from fitting.waves.correlated_noise import Correlation, correlation
 from fitting.waves.edges import RegionMatrices
 
-#: STARTS: storage moduli [Pa] from which the starting point of a search is chosen. LOSS: ratio of loss to storage
-#: modulus at the starting point.
-STARTS, LOSS = np.geomspace(500.0, 40500.0, 5), 0.3
+#: The starting point of a search is chosen from several storage moduli. WAVE_VOXELS, WAVE_BODIES: the wavelengths of
+#: shear waves with these moduli go from WAVE_VOXELS voxels to WAVE_BODIES lengths of the body. MODULI_APART: largest
+#: ratio between two neighbouring moduli. ROUGHLY: the best modulus is then found with this relative accuracy. LOSS:
+#: ratio of loss to storage modulus at the starting point.
+WAVE_VOXELS, WAVE_BODIES, MODULI_APART, ROUGHLY, LOSS = 4.0, 6.0, 3.0, 0.1, 0.3
 #: ITERATIONS: maximum number of iterations. ENOUGH: the iterations end if the next change of each modulus, divided by
 #: the standard error of this modulus, is below this value.
 ITERATIONS, ENOUGH = 20, 0.1
@@ -72,16 +76,35 @@ class _State(NamedTuple):
     hessian: np.ndarray  # (2 R + P, 2 R + P)
 
 
-def first_modulus(m: Matrices, waves: MeasuredWaves) -> complex:
-    """Return a starting point of the search for the moduli [Pa]: the complex modulus of a uniform body. It is the value
-    from `STARTS` and `LOSS` with the lowest chi^2 at the lowest frequency."""
-    ones = np.ones(m.rows.shape[-1])
+def first_modulus(m: Matrices, waves: MeasuredWaves, density: float, voxel: float, length: float) -> float:
+    """Return a rough storage modulus [Pa] of the whole body, from which the search for the moduli starts: the modulus
+    with the lowest chi^2 at the lowest frequency. The loss modulus is `LOSS` times the storage modulus.
 
-    def out_of_balance(G):
-        at = waves.omega[0], waves.motion[0], waves.sd[0]
-        return balance.balanced(m, G * ones, *at).chi2
+    The moduli that are tried follow from the wavelengths that the voxels can show. So they have the right size for all
+    units of the data.
 
-    return min(STARTS * (1 + LOSS * 1j), key=out_of_balance)
+    Args:
+        m: result of `balance.matrices`.
+        waves: the measured waves.
+        density: [kg/m^3].
+        voxel: smallest distance between neighbouring voxels [m].
+        length: longest side of the body [m].
+    """
+    ends = density * (waves.omega[0] / (2 * np.pi) * np.array([WAVE_VOXELS * voxel, WAVE_BODIES * length])) ** 2
+    number = 1 + math.ceil(math.log(ends[1] / ends[0]) / math.log(MODULI_APART))
+    every = np.ones(m.rows.shape[-1])
+
+    def out_of_balance(logarithm: float) -> float:
+        modulus = math.exp(logarithm)
+        # With the equations multiplied by this ratio, chi^2 is that for the pressure term of each modulus.
+        C = balance.rows_of_balance(m, modulus * (1 + LOSS * 1j) * every, waves.omega[0]) * (m.typical / modulus)
+        return balance.likeliest(C, m.pressure, waves.motion[0], waves.sd[0]).chi2
+
+    tried = np.log(np.geomspace(ends[0], ends[1], number))
+    best = int(np.argmin([out_of_balance(each) for each in tried]))
+    near = tried[max(best - 1, 0)], tried[min(best + 1, number - 1)]
+    found = scipy.optimize.minimize_scalar(out_of_balance, bounds=near, method="bounded", options={"xatol": ROUGHLY})
+    return math.exp(found.x)
 
 
 def moduli_of_regions(
