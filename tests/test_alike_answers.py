@@ -1,5 +1,7 @@
 """Correlated noise of neighbouring points in relaxation and creep tests: standard errors, models, posterior."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -52,6 +54,22 @@ def test_errors_of_shared_noise_are_those_of_many_draws():
     assert np.all((np.median(before, axis=0) < 0.7 * scatter)[1:])
     # The scatter of 16 draws has an error of 18 %; the correlation length of the noise is known only roughly.
     assert np.all(np.median(after, axis=0) > 0.6 * scatter) and np.all(np.median(after, axis=0) < 2.5 * scatter)
+
+
+def test_a_dashpot_leaves_the_other_errors_those_of_correlated_noise():
+    """The error of an exponent at its bound is infinite. The noise then counted as independent: 3042 ± 9 Pa s was found
+    for the dashpot of 3000 Pa s, without a word on the correlated noise.
+    """
+    time = np.geomspace(0.1, 600, 80)
+    creep = time / 3000 + time**0.3 / (300 * math.gamma(1.3))
+    strain = 10 * creep * (1 + 0.01 * _autoregression(np.random.default_rng(3), 80, 0.85))
+    at = np.concatenate([[0.0, 1e-7], time])
+    stress = np.concatenate([[0.0], np.full(81, 10.0)])
+    fit = choose_in_time(TimeTest("creep", at, stress, np.concatenate([[0.0, 0.0], strain]), at > 1e-6), "fractional")
+    own = fit.parameters
+    assert own.names[:2] == ("slow_springpot", "slow_exponent") and own.standard_errors[1] == np.inf
+    assert INDEPENDENT in fit.details and any("neighbouring values is correlated" in w for w in fit.warnings)
+    assert abs(own.values[0] - 3000) < 2 * own.standard_errors[0] < 600
 
 
 def test_white_noise_changes_nothing():

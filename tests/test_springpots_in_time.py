@@ -236,3 +236,28 @@ def test_the_spectrum_of_a_relaxation_test_gets_a_note_instead_of_draws(tmp_path
     shown = capsys.readouterr()
     assert "note: --samples works only with models of a few parameters" in shown.err
     assert "relaxation, spectrum" in shown.out and (tmp_path / "fit.json").is_file()
+
+
+def creep_of_burgers(spring: float) -> time_tests.TimeTest:
+    """Creep of a Maxwell and a Kelvin element in series, with 0.5 % noise. `spring`: modulus [Pa] beside the dashpot of
+    the Maxwell element; 0: a fluid."""
+    t = np.geomspace(0.02, 300, 60)
+    flow = (1 - np.exp(-t * spring / 1600)) / spring if spring else t / 1600
+    strain = 10 * (1 / 800 + flow + (1 - np.exp(-t / 3)) / 500)
+    strain = strain * (1 + 0.005 * np.random.default_rng(0).standard_normal(len(t)))
+    at, stress = np.concatenate([[0.0, 1e-7], t]), np.concatenate([[0.0], np.full(len(t) + 1, 10.0)])
+    return time_tests.TimeTest("creep", at, stress, np.concatenate([[0.0, 0.0], strain]), at > 1e-6)
+
+
+def test_a_fluid_is_no_solid_by_chance():
+    """The solid, whose criterion is 2.3 lower by chance, was chosen, and `auto` did not show the fluid."""
+    fit = springpots_in_time.choose_in_time(creep_of_burgers(0.0), "auto", 2)
+    rows = {row["model"]: row["above_the_lowest"] for row in fit.details["tried"]}
+    assert fit.kind.name == "prony_fluid" and 0 <= rows["prony"] < rows["prony_fluid"] < rows["prony"] + 6
+    assert min(rows.values()) == 0 and set(rows) > {"spectrum", "springpot"}
+
+
+def test_a_weak_solid_is_told_that_it_may_be_a_fluid():
+    fit = springpots_in_time.choose_in_time(creep_of_burgers(0.06), "prony", 2)
+    assert fit.kind.name == "prony"
+    assert any("prony_fluid explains the data about as well as prony" in w for w in fit.warnings)

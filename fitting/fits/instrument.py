@@ -115,16 +115,18 @@ def nuisances_of(sweep: Sweep) -> list[Nuisance]:
 def without_error_of_inertia(fit: Fit, sweep: Sweep, factors: compression.Shares | None = None) -> tuple[Fit, Sweep]:
     """Fit the instrument's errors together with the Prony modes, and return the fit and the corrected sweep.
 
-    The fit and the sweep are returned unchanged if the sweep has no data of the instrument, or if the model has no free
-    Prony modes. If one of the errors changes when the upper end of the band is left out, all errors are reported, but
-    the moduli are not corrected for them. If the number of modes was chosen automatically, more modes are tried, too.
-    If the modes were compared with other models, these models are fitted again to the corrected moduli. All these fits
-    use Levenberg-Marquardt, also if the first fit used BFGS. `factors`: as for `of_compressed_sample`, if the fit is
-    that of a compressed sample.
+    The fit and the sweep are returned unchanged if the sweep has no data of the instrument. For a model without free
+    Prony modes, see `_of_rival_modes`. If one of the errors changes when the upper end of the band is left out, all
+    errors are reported, but the moduli are not corrected for them. If the number of modes was chosen automatically,
+    more modes are tried, too. If the modes were compared with other models, these models are fitted again to the
+    corrected moduli. All these fits use Levenberg-Marquardt, also if the first fit used BFGS. `factors`: as for
+    `of_compressed_sample`, if the fit is that of a compressed sample.
     """
     begin, known = time.perf_counter(), nuisances_of(sweep)
-    if not known or fit.kind.values is not None:
+    if not known:
         return fit, sweep
+    if fit.kind.values is not None:
+        return _of_rival_modes(fit, sweep, factors)
     weighed = _with_noise_as_measured(sweep)
     tried = [_errors_of_instrument(_fitted_again(fit, weighed), weighed), *_with_more_modes(fit, weighed)]
     determined = [own for own in tried if _all_modes_determined(own, weighed)] or tried[:1]
@@ -150,12 +152,27 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep, factors: compression.Shares
     return refitted._replace(run_time=fit.run_time + time.perf_counter() - begin), corrected
 
 
+def _of_rival_modes(fit: Fit, sweep: Sweep, factors: compression.Shares | None) -> tuple[Fit, Sweep]:
+    """Return the fit of Prony modes and the sweep, both corrected for the instrument's errors, if these modes and
+    errors explain the sweep better than `fit`. Otherwise `fit` and the sweep are returned unchanged. `fit`: a model
+    without free modes. A spectrum, for example, can fit the error of the inertia as a part of the material.
+    """
+    modes = models.rival_modes(fit)
+    if modes is None:
+        return fit, sweep
+    found, corrected = without_error_of_inertia(modes, sweep, factors)
+    prior = float(np.sum(used_errors(found, sweep)[1] ** 2))
+    better = corrected is not sweep and models.is_preferred(found, fit, prior)
+    return (found, corrected) if better else (fit, sweep)
+
+
 def _with_more_modes(fit: Fit, sweep: Sweep) -> list[Corrected]:
-    """Return the instrument errors with more modes. The list is empty if the user gave the number of modes.
+    """Return the instrument errors with more modes. The list is empty if the user gave the number of modes. The number
+    of modes of a fluid is always chosen.
 
     If the inertia is wrong, a fit with enough modes may not converge, so too few modes are chosen at first.
     """
-    if viscoelastic.TRIED not in fit.details:
+    if viscoelastic.TRIED not in fit.details and fit.kind.name != viscoelastic.FLUID.name:
         return []
     most = min(fit.modes + 2, viscoelastic.most_modes(sweep))
     found = [_from_several_starts(fit, modes, sweep) for modes in range(fit.modes + 1, most + 1)]
@@ -176,7 +193,7 @@ def _from_several_starts(fit: Fit, modes: int, sweep: Sweep) -> Corrected | None
         if not (np.all(moved.storage > 0) and np.all(moved.loss > 0)):
             continue
         try:
-            begin = generalised_maxwell.starts(moved, modes, generalised_maxwell.spectrum(moved))
+            begin = models.starts_of_kind(fit.kind, moved, modes, generalised_maxwell.spectrum(moved))
             own = viscoelastic.modes_from(moved, begin, fit.kind)
             found.append(_errors_of_instrument(own, sweep, values))
         except (ArithmeticError, RuntimeError, ValueError):  # no fit at this start

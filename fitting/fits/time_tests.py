@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from fitting.fits import viscoelastic
+from fitting.fits.families import choice
 from fitting.fits.viscoelastic import FLUID, Kind
 from fitting.methods import generalised_maxwell, kramers_kronig, time_response, uncertainty
 from fitting.methods.estimate import Estimate
@@ -177,8 +178,8 @@ def _spread_places(time: np.ndarray, number: int) -> np.ndarray:
 
 
 def fit(test: TimeTest, modes: int | str = "auto") -> TimeFit:
-    """Choose the number of modes, and a solid or a fluid, by the lowest information criterion. A fit can be chosen only
-    if the test determines all its modes.
+    """Choose the number of modes, and a solid or a fluid, by the information criterion. A fit can be chosen only if the
+    test determines all its modes. A solid is chosen only with strong evidence against a fluid (`choice.preferred`).
 
     Args:
         test: data.
@@ -215,7 +216,8 @@ def _raised(test: TimeTest, rows: np.ndarray, numbers: range, kind: Kind) -> lis
 
 
 def _chosen_model(tried: list[TimeFit], test: TimeTest) -> TimeFit:
-    return min([f for f in tried if identifiable(f, test)] or tried, key=criterion)
+    able = [f for f in tried if identifiable(f, test)] or tried
+    return able[choice.preferred([choice.label_of(f) for f in able], list(map(criterion, able)))]
 
 
 def criterion(fit: TimeFit) -> float:
@@ -366,7 +368,7 @@ def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
     if lowest < criterion(chosen) - 10 and closer.modes != chosen.modes:
         errors = [float(f.relative_errors.mean()) for f in (closer, chosen)]
         out.append(viscoelastic.closer_but_not_chosen(closer.modes, errors, closer.converged))
-    out += [] if elastic else uncertainty.superfluous(test, chosen.uncertainty)
+    out += [] if elastic else [*uncertainty.superfluous(test, chosen.uncertainty), *_rival_kind(chosen, tried, test)]
     low, high = test.resolved
     for k, tau in enumerate(chosen.model.relaxation_times):
         if not elastic and not low <= tau <= high:
@@ -378,6 +380,15 @@ def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
     details |= {ELASTIC: elastic} if elastic else {}
     seconds = {n: sum(getattr(f, n) for f in tried) for n in ("run_time", "compile_time")}
     return chosen._replace(warnings=tuple(out), details=details, **seconds)
+
+
+def _rival_kind(chosen: TimeFit, tried: list[TimeFit], test: TimeTest) -> list[str]:
+    """Return a warning if a solid is chosen, and a fluid explains the test about as well."""
+    fluids = [f for f in tried if f.kind.name == FLUID.name and identifiable(f, test)]
+    if chosen.kind.name == FLUID.name or not fluids:
+        return []
+    apart = min(map(criterion, fluids)) - criterion(chosen)
+    return [choice.undecided(FLUID.name, chosen.kind.name, apart)] if apart < choice.STRONG else []
 
 
 #: Key in `TimeFit.details`: modulus [Pa], with standard error, of an elastic material that explains the test equally

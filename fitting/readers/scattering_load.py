@@ -109,12 +109,19 @@ def _straight_ramp(
     def line_from(begin: float, end: float, low: float) -> np.ndarray:
         return low + rise(time, begin, end) * size(begin, end, low)
 
-    def misfit(x: np.ndarray) -> float:
-        return float(np.sum((line_from(x[0], x[1], low) - driven) ** 2))
+    before = max(rest - 1, 0)
+    start, spacing = time[[before, first]], (time[first] - time[before]) / (first - before)
+
+    def misfit(later: np.ndarray) -> float:
+        """Return the misfit if the ramp begins and ends `later` (2,) than `start`. The unit of `later` is `spacing`."""
+        begin, end = start + spacing * later
+        return float(np.sum(((line_from(begin, end, low) - driven) / noise) ** 2))
 
     ends = np.linspace(time[rest], time[min(first + max(3, (first - rest) // 4), len(time) - 1)], 400)
     near = ends[int(np.argmin([np.sum((line_from(time[0], end, 0.0) - driven) ** 2) for end in ends]))]
-    free = scipy.optimize.minimize(misfit, [time[max(rest - 1, 0)], time[first]], method="Nelder-Mead").x
+    # The tolerances of the search are absolute, so it must not depend on the units of time and load.
+    simplex = {"initial_simplex": np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])}
+    free = start + spacing * scipy.optimize.minimize(misfit, np.zeros(2), method="Nelder-Mead", options=simplex).x
     # First try: a ramp from load 0 at the first row. Second try: a ramp from the load at rest, at a fitted time.
     for begin, end, level in ((time[0], near, 0.0), (free[0], free[1], low)):
         line = line_from(begin, end, level)

@@ -22,6 +22,8 @@ SPECIAL_CASES = {
 #: A model is chosen only if its criterion is lower than the criterion of its special case by at least this difference
 #: (strong evidence).
 GENERAL = 6.0
+#: Difference of the criterion that counts as very strong evidence (Kass and Raftery 1995).
+STRONG = 10.0
 
 
 class Label(NamedTuple):
@@ -54,6 +56,16 @@ def preferred(labels: Sequence[Label], criteria: Sequence[float]) -> int:
     }
     left = [k for k in range(len(labels)) if k not in beaten] or list(range(len(labels)))
     return min(left, key=lambda k: criteria[k])
+
+
+def undecided(second: str, chosen: str, apart: float) -> str:
+    """Return the warning that the data do not decide between the model `chosen` and the model `second`. `apart`: the
+    criterion of `second` minus that of `chosen`."""
+    return (
+        f"{second} explains the data about as well as {chosen} (criterion {abs(apart):.2g} "
+        f"{'higher' if apart >= 0 else 'lower'}; {STRONG:g} is strong evidence). The data do not decide between these "
+        "models, and their moduli may differ much outside the measured band"
+    )
 
 
 class OfAKind(Protocol):

@@ -13,7 +13,7 @@ import numpy as np
 
 from fitting.fits import viscoelastic
 from fitting.fits.families import limits
-from fitting.fits.families.choice import contains, label_of, preferred
+from fitting.fits.families.choice import STRONG, contains, label_of, preferred, undecided
 from fitting.fits.viscoelastic import Fit, Kind, information_criterion, number_of_parameters
 from fitting.methods import as_prony_modes, generalised_maxwell, host, relaxation_spectrum, springpots, uncertainty
 from fitting.methods.estimate import Estimate
@@ -23,8 +23,6 @@ from fitting.readers.rheometer import Sweep
 from liverjax.core.struct import Content
 
 MODELS = ("prony", "fractional", "spectrum", "auto")
-#: Difference of the criterion that counts as very strong evidence (Kass and Raftery 1995, J. Am. Stat. Assoc. 90).
-STRONG = 10.0
 #: Key in `Fit.details` of the table of compared models.
 TABLE_OF_MODELS = "models_compared"
 
@@ -214,14 +212,20 @@ def identifiable(fit: Fit, sweep: Sweep) -> bool:
     return fit.converged and (fit.kind.effective is not None or bool(np.all(determined(fit.parameters))))
 
 
+def starts_of_kind(kind: Kind, sweep: Sweep, modes: int, dense: Spectrum) -> np.ndarray:
+    """Return starting points for Prony modes of a solid or of a fluid. `dense`: see `choose`."""
+    starts = generalised_maxwell.starts(sweep, modes, dense)
+    fluid_of = generalised_maxwell.fluid_of
+    return np.stack([fluid_of(u) for u in starts]) if kind.name == viscoelastic.FLUID.name else starts
+
+
 def fluid(sweep: Sweep, dense: Spectrum) -> Fit:
     """Fit Prony modes of a fluid, which has no equilibrium modulus. The information criterion chooses the number of
     modes."""
     largest = min(uncertainty.supported_modes(sweep), generalised_maxwell.largest_number_of_modes(sweep))
     chosen, failures = None, 0
     for modes in range(1, largest + 1):
-        solid = generalised_maxwell.starts(sweep, modes, dense)
-        starts = np.stack([generalised_maxwell.fluid_of(u) for u in solid])
+        starts = starts_of_kind(viscoelastic.FLUID, sweep, modes, dense)
         fit = viscoelastic.modes_from(sweep, starts, viscoelastic.FLUID)
         better = chosen is None or information_criterion(fit) < information_criterion(chosen)
         if chosen is None or (better and identifiable(fit, sweep)):
@@ -281,6 +285,24 @@ def _with_rivals(chosen: Fit, tried: list[Fit], sweep: Sweep) -> Fit:
     )
 
 
+def rival_modes(chosen: Fit) -> Fit | None:
+    """Return the fit of free Prony modes with which `chosen` was compared, or None if there is no such fit. This fit
+    gets the table of the compared models, and the time of their computation."""
+    free = {fit.kind.name: fit for fit in chosen.rivals if fit.kind.values is None}
+    if not free:
+        return None
+    fit = free.get("prony", next(iter(free.values())))
+    details = fit.details | {TABLE_OF_MODELS: chosen.details[TABLE_OF_MODELS]}
+    return fit._replace(details=details, run_time=chosen.run_time, compile_time=chosen.compile_time)
+
+
+def is_preferred(corrected: Fit, other: Fit, prior: float) -> bool:
+    """Return whether a fit with an error of the instrument is chosen, and not `other`, a fit of the uncorrected sweep.
+    `prior`: sum of squares of the errors of the instrument, in standard deviations of their priors."""
+    criteria = [information_criterion(corrected) + prior, information_criterion(other)]
+    return preferred([label_of(corrected), label_of(other)], criteria) == 0
+
+
 def compared_again(chosen: Fit, sweep: Sweep, at_rest: Callable[[Fit], Fit]) -> Fit:
     """Return the fit of free Prony modes with the other models, which are fitted again to a corrected sweep. Nothing is
     fitted if the fit was not compared with other models before. The correction was found with the chosen model, so the
@@ -296,7 +318,7 @@ def compared_again(chosen: Fit, sweep: Sweep, at_rest: Callable[[Fit], Fit]) -> 
     dense, prony, fluids = generalised_maxwell.spectrum(sweep), chosen, viscoelastic.FLUID.name
     if chosen.kind.name == fluids:
         modes = next(row["modes"] for row in chosen.details[TABLE_OF_MODELS] if row["model"] == "prony")
-        prony = viscoelastic.closed_form(sweep, modes, dense)
+        prony = viscoelastic.closed_form(sweep, max(modes, chosen.modes), dense)
     others = [fit for fit in every_model(sweep, "auto", prony, dense) if fit.kind.name != chosen.kind.name]
     return _with_rivals(chosen, [*(at_rest(fit) for fit in others), chosen], sweep)
 
@@ -343,12 +365,7 @@ def _rival_models(chosen: Fit, tried: list[Fit], able: list[Fit]) -> list[str]:
             f"{second.kind.name} explains the corrected data better than {chosen.kind.name} (criterion {-apart:.2g} "
             "lower; 10 is strong evidence), and their moduli may differ much outside the measured band",
         ]
-    return [
-        *out,
-        f"{second.kind.name} explains the data about as well as {chosen.kind.name} (criterion {abs(apart):.2g} "
-        f"{'higher' if apart >= 0 else 'lower'}; 10 is strong evidence). The data do not decide between these models, "
-        "and their moduli may differ much outside the measured band",
-    ]
+    return [*out, undecided(second.kind.name, chosen.kind.name, apart)]
 
 
 def comparison(fit: Fit) -> list[str]:

@@ -195,6 +195,7 @@ def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> Tim
     fits = [f for f in tried if able(f, test)] or tried
     best = _preferred_of(fits, time_tests.criterion)
     rows = _compared_models(tried, time_tests.criterion, test)
+    rows = _with_other_kind(rows, prony) if model == "auto" else rows
     sentences = best.warnings if best is prony else (*best.warnings, *_cautions_in_time(best))
     seconds = {n: sum(getattr(f, n) for f in {id(f): f for f in (*tried, prony)}.values()) for n in TIMES}
     whole = with_own_noise(best._replace(warnings=sentences, details=best.details | {"tried": rows}, **seconds))
@@ -230,6 +231,23 @@ def _compared_models(tried: Sequence, criterion: Callable, data: uncertainty.Ban
         }
         for f in tried
     ]
+    return sorted(rows, key=lambda row: row["above_the_lowest"])
+
+
+def _with_other_kind(rows: list[Content], prony: TimeFit) -> list[Content]:
+    """Return the table of compared models with one more row: the best fluid if `prony` is a solid, or the best solid if
+    `prony` is a fluid. No row is added if no such fit was tried, or if the test determines no such fit."""
+    tried: list[Content] = prony.details["tried"]
+    others = [row for row in tried if row["model"] != prony.kind.name and row["identifiable"]]
+    if not others:
+        return rows
+    (own,) = (row for row in tried if (row["model"], row["modes"]) == (prony.kind.name, prony.modes))
+    (here,) = (row for row in rows if row["model"] == prony.kind.name)
+    other = min(others, key=lambda row: row["above_the_lowest"])
+    above = here["above_the_lowest"] + other["above_the_lowest"] - own["above_the_lowest"]
+    rows = [*rows, {key: other[key] for key in here} | {"above_the_lowest": above}]
+    lowest = min(row["above_the_lowest"] for row in rows)
+    rows = [row | {"above_the_lowest": row["above_the_lowest"] - lowest} for row in rows]
     return sorted(rows, key=lambda row: row["above_the_lowest"])
 
 

@@ -50,12 +50,9 @@ def with_own_noise(fit: TimeFit) -> TimeFit:
     be correlated (`with_alike_noise`). The noise may also be larger for some values than for others, for example if it
     grows with time.
     """
-    own = fit.parameters
-    if fit.kind.effective is not None or not np.all(np.isfinite((own or fit.uncertainty).standard_errors)):
+    if not _has_errors_of_noise(fit):
         return fit
     fit = with_alike_noise(fit)
-    if not fit.uncertainty.noise > 0:
-        return fit
     r, J = np.asarray(fit.solution.residuals), np.asarray(fit.solution.jacobian)
     root, u, own = uneven_root(J, r, np.eye(J.shape[1])), np.asarray(fit.solution.u), fit.parameters
     modes = _at_least(fit.uncertainty, host.with_jacobian(_modes_of(fit), u)[1] @ root)
@@ -63,6 +60,14 @@ def with_own_noise(fit: TimeFit) -> TimeFit:
         own = _at_least(own, host.with_jacobian(fit.kind.values, u)[1] @ root)
     fluid = uncertainty.like_a_fluid(modes, "measure longer") if fit.kind.name == "prony" else []
     return fit._replace(uncertainty=modes, parameters=own, warnings=(*fit.warnings, *fluid))
+
+
+def _has_errors_of_noise(fit: TimeFit) -> bool:
+    """Return whether some standard errors are known, and come from noise only. Some of the others may be infinite, for
+    example that of an exponent at its bound. The errors of a spectrum come from its prior too."""
+    numbers = fit.parameters or fit.uncertainty
+    known = np.all(np.isfinite(numbers.values)) and np.any(np.isfinite(numbers.standard_errors))
+    return bool(known and fit.kind.effective is None and fit.uncertainty.noise > 0)
 
 
 def _at_least(estimate: Estimate, root: np.ndarray) -> Estimate:
@@ -85,10 +90,7 @@ def with_alike_noise(fit: TimeFit) -> TimeFit:
     averages or the model lacks a part of the spectrum. The more probable kind of correlation is used.
     """
     r, J = np.asarray(fit.solution.residuals), np.asarray(fit.solution.jacobian)
-    numbers = fit.parameters or fit.uncertainty
-    if fit.kind.effective is not None or not np.all(np.isfinite(numbers.standard_errors)):
-        return fit  # the errors of a spectrum come from its prior too, not only from noise
-    if not fit.uncertainty.noise > 0:
+    if not _has_errors_of_noise(fit):
         return fit
     size, constant = _sizes(fit, r, J)
     inverse = np.linalg.pinv(J) * size
