@@ -180,6 +180,20 @@ def test_waves_without_a_mass_are_told():
     assert cautions_of_waves(varied) == []
 
 
+def test_waves_in_a_stiff_part_with_coarse_elements_are_told():
+    """Only the elements with the shortest waves were compared with these waves."""
+    fine, coarse = lj.shapes.box((0.005, 0.005, 0.005), (1, 1, 1)), lj.shapes.box((0.15, 0.15, 0.15), (1, 1, 1))
+    points = np.concatenate([fine.points, np.asarray(coarse.points) + np.array([1.0, 0.0, 0.0])])
+    mesh = lj.tet_mesh(points, np.concatenate([fine.tetrahedra, coarse.tetrahedra + len(fine.points)]))
+    law = lj.laws.NeoHookean(mu=np.repeat([800.0, 12800.0], fine.number_of_elements), bulk=1e5)
+    solve = lj.Solve(kind="harmonic", frequencies=jnp.array([20.0, 1.0]))
+    whole = lj.Scene(mesh=mesh, law=law, body=lj.Body(density=1060.0), solve=solve)
+    (said,) = [s for s in cautions_of_waves(whole) if "Hz" in s]
+    assert said.startswith("at 20 Hz shear waves are about 0.17 m long where the edges of the elements are 0.18 m long")
+    slow = replace(whole, solve=replace(solve, frequencies=jnp.array([5.0])))
+    assert not any("Hz" in s for s in cautions_of_waves(slow))
+
+
 @pytest.mark.parametrize(
     ("change", "mu", "hertz", "said"),
     [

@@ -10,6 +10,7 @@ import pytest
 import liverjax as lj
 from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
+from liverjax.mesh.surface import areas as triangle_areas
 from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.physics.contact.shapes import SHAPES, distance
 from liverjax.scenes.scene_file import scene_from
@@ -198,7 +199,7 @@ def test_gradients_through_closing_contact():
 @pytest.mark.ci
 @pytest.mark.parametrize("precision", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_forces_on_obstacles_know_regions_and_precision(precision):
-    """The default contact stiffness follows from the stiffest law of the body, as in the run, so the forces balance."""
+    """The default contact stiffness follows from the law of each region, as in the run, so the forces balance."""
     scene = lying(steps=1, precision=precision, tolerance=1e-8 if precision == "float64" else 1e-4)
     stiff = lj.Region(elements=jnp.arange(8), law={"mu": 8e4})
     plane = replace(scene.physics[0], stiffness=None)
@@ -207,6 +208,24 @@ def test_forces_on_obstacles_know_regions_and_precision(precision):
     found = lj.obstacle_forces(scene, result)
     tolerance = 1e-6 if precision == "float64" else 1e-2
     assert np.isclose(found.force[0, -1, 2], -50.0 * SIDE**2, rtol=tolerance)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_the_default_stiffness_is_that_of_the_element_at_each_triangle(order):
+    """The modulus was that of the stiffest element of the body, so a stiff region far away prevented convergence."""
+    mesh = lj.shapes.box((SIDE, SIDE, SIDE), (2, 2, 2))
+    mesh = lj.quadratic(mesh) if order == 2 else mesh
+    triangles = surface(mesh)
+    at = [np.flatnonzero(np.isin(mesh.tetrahedra, own).sum(axis=1) == 3)[0] for own in np.asarray(triangles)]
+    mu = jnp.linspace(1.0, 5.0, mesh.number_of_elements)
+    law = replace(LAW, mu=mu, bulk=1.0)
+
+    def stiffness(mesh, triangles, law):
+        return Obstacle(triangles=triangles).in_body(mesh, mesh.at_points(law)).stiffness
+
+    areas = np.linalg.norm(triangle_areas(mesh.points, triangles), axis=1)
+    found = jax.jit(stiffness)(mesh, triangles, law)
+    assert np.allclose(found, 100 * (1 + 4 / 3 * mu[np.array(at)]) / np.sqrt(areas))
 
 
 def on_its_own() -> lj.Scene:

@@ -353,6 +353,34 @@ def test_warnings_about_the_drained_face_use_the_region_there():
     assert "300 to 400 Pa (it differs between regions)" in porosity.bulk_in_force(sponge.porosity, sponge.law)
 
 
+def test_a_part_of_the_drained_face_with_little_flow_is_told():
+    """The median of all drained elements has a thick layer, so the elements with a thin layer were not noticed."""
+    mesh = lj.shapes.box((0.02, 0.02, 0.03), (2, 2, 3))
+    tets, top = np.asarray(mesh.tetrahedra), np.asarray(mesh.node_sets["z_max"])
+    at = np.flatnonzero(np.isin(tets, top).sum(axis=1) == 3)
+    permeability = np.full(mesh.number_of_elements, 1e-5)
+    permeability[at[:3]] = 1e-13
+    sponge = replace(SPONGE, drained=top, permeability=permeability)
+    scene = lj.Scene(
+        mesh=mesh, law=lj.laws.NeoHookean(mu=SHEAR, bulk=1.0), porosity=sponge, solve=lj.Solve(dt=0.05, steps=1)
+    )
+    everywhere = replace(scene, porosity=replace(sponge, permeability=1e-13))
+    (said,) = of_drained_layer(scene, 0.05, "in {:.3g} s")
+    (all_slow,) = of_drained_layer(everywhere, 0.05, "in {:.3g} s")
+    assert len(at) == 8 and said == all_slow.replace("at the drained", "at some of the drained")
+    # The pressure overshoots only beside the elements with little flow.
+    pressure = np.ones(mesh.number_of_nodes)
+    pressure[np.setdiff1d(tets[at[:3]], top)], pressure[top] = 1.3, 0.0
+    positions = np.asarray(mesh.points)[None]
+    result = lj.Result(
+        times=np.array([0.05]), positions=positions, reactions=None, status=None, statistics=None,
+        pressure=pressure[None],
+    )  # fmt: skip
+    (said,), (all_slow,) = ([s for s in cautions_of_run(s, result) if "overshoots" in s] for s in (scene, everywhere))
+    assert said.startswith("the pressure overshoots beside the drained nodes, by 23 %")
+    assert said.split("use a dt of ")[1] == all_slow.split("use a dt of ")[1]
+
+
 @pytest.mark.parametrize("kind", ["neo_hookean", "neo_hookean_compressible"])
 def test_the_drained_layer_contains_the_bulk_modulus_that_the_law_keeps(kind):
     """The bulk modulus of a law was left out, so a layer that was thick enough was called too thin."""

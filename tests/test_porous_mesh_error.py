@@ -8,6 +8,7 @@ import pytest
 import liverjax as lj
 from liverjax.core.struct import replace
 from liverjax.elements.gradients import volume_ratios
+from liverjax.mesh.nodal import nodal_volumes
 from liverjax.mesh.refinement import places_in, quarters, refined
 from liverjax.mesh.selection import boundary_triangles
 from liverjax.mesh.surface import areas
@@ -251,6 +252,25 @@ def test_pressures_between_drained_nodes_and_inlets_are_known(order):
     y, known, given = pressures(drained=None, inlet=(rest, at_row))
     assert known.sum() == 25 and np.allclose(given[known & (np.abs(y[:, 0] - 0.075) < 0.01)], 1.5)
     assert pressures(drained=None, inlet=(rest, replace(at_row, history=jnp.ones(2))))[1].sum() == 20
+
+
+@pytest.mark.parametrize("low", [100.0, 500.0])
+def test_a_density_with_a_jump_keeps_its_mass_on_the_refined_mesh(low):
+    """Quadratic shape functions made the density negative, and changed the mass by 7 %."""
+    mesh = lj.quadratic(lj.shapes.box((0.02, 0.02, 0.07), (1, 1, 2)))
+    z = mesh.points[:, 2]
+
+    def refined_body(density):
+        scene = lj.Scene(mesh=mesh, law=lj.laws.NeoHookean(mu=1.0, bulk=2.0), body=lj.Body(density=density))
+        fine = on_refined_mesh(scene)[0]
+        return fine.mesh, fine.body.density
+
+    density = jnp.where(z > 0.035, 1060.0, low)
+    fine, found = refined_body(density)
+    assert np.isclose(found @ nodal_volumes(fine), density @ nodal_volumes(mesh), rtol=1e-12)
+    assert found.min() > 0.9 * low and found.max() < 1.1 * 1060.0
+    fine, found = refined_body(500.0 + 1e4 * z)  # a linear density is kept
+    assert np.allclose(found, 500.0 + 1e4 * fine.points[:, 2], rtol=1e-12)
 
 
 def test_free_midside_nodes_stay_free_on_the_refined_mesh():

@@ -73,7 +73,12 @@ _INTEGRALS = {1: (1 / 4,), 2: (-1 / 20, 1 / 5), 3: (-1 / 20, 1 / 5)}
 @partial(jax.jit, inline=True)
 def nodal_volumes(mesh: TetMesh) -> jax.Array:
     """Return lumped mass divided by density (V,) [m^3]. In linear elements, a vertex gets a quarter of the volume."""
-    return _weighted_parts(mesh, _LUMPED[min(mesh.order, 2)], mesh.volumes)
+    return lumped_sums(mesh, mesh.volumes)
+
+
+def lumped_sums(mesh: TetMesh, size: jax.Array) -> jax.Array:
+    """Return the sums (V,) at the nodes if each element shares its number `size` (E,) like a lumped mass."""
+    return _weighted_parts(mesh, _LUMPED[min(mesh.order, 2)], size)
 
 
 @partial(jax.jit, inline=True)

@@ -8,7 +8,7 @@ import numpy as np
 from jax.typing import DTypeLike
 
 from liverjax.core.struct import Indices
-from liverjax.mesh.shape_functions import triangle_rule
+from liverjax.mesh.shape_functions import FACES, triangle_rule
 from liverjax.mesh.tetrahedra import TetMesh
 
 #: Edges of a triangle. Middle nodes are listed in this order.
@@ -46,6 +46,20 @@ def areas(points: jax.Array, triangles: Indices) -> jax.Array:
     """Return area times unit normal (m, 3) [m^2] of flat triangles."""
     corner = points[triangles]
     return 0.5 * jnp.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+
+
+@partial(jax.jit, inline=True)
+def elements_of_faces(mesh: TetMesh, triangles: Indices) -> jax.Array:
+    """Return, for each triangle (m, 3) of the surface, the number (m,) of the element with this face.
+
+    All node numbers may be unknown (inside jit).
+    """
+    faces = jnp.concatenate([mesh.tetrahedra[:, list(face)] for face in FACES])  # number f E + e: face f of element e
+    ordered = jnp.sort(jnp.concatenate([faces, triangles[:, :3]]), axis=1)
+    order = jnp.lexsort(ordered.T)  # a triangle comes directly after the equal face
+    places = jnp.where(order < len(faces), jnp.arange(len(order)), 0)
+    face = order[jax.lax.cummax(places)]
+    return jnp.zeros_like(order).at[order].set(face)[len(faces) :] % mesh.number_of_elements
 
 
 def nodal_shares(mesh: TetMesh, triangles: Indices) -> list[tuple[Indices, float]]:

@@ -19,7 +19,8 @@ from liverjax.laws import Law
 from liverjax.laws.by_region import ByRegion
 from liverjax.mesh.adjacency import node_numbers
 from liverjax.mesh.locate import weights
-from liverjax.mesh.promotion import middles_between, middles_of_places
+from liverjax.mesh.nodal import element_density, lumped_sums, nodal_volumes
+from liverjax.mesh.promotion import middles_between, middles_of_places, on_middles
 from liverjax.mesh.refinement import middles_of_whole_faces, parts_of, places_in, quarters, refined
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.attached.vessel import Vessel
@@ -106,7 +107,8 @@ def on_refined_mesh(scene: Scene) -> tuple[Scene, Within]:
 
     body = scene.body
     if body is not None and jnp.ndim(body.density):
-        body = replace(body, density=within.field(jnp.asarray(body.density)))
+        density = jnp.asarray(body.density)
+        body = replace(body, density=within.field(density) if old.order == 1 else _density_of_parts(old, mesh, density))
     made = replace(
         scene,
         mesh=mesh,
@@ -174,6 +176,18 @@ def _of_parts(E: int, numbers: T) -> T:
         return jnp.repeat(jnp.asarray(a), 8, axis=-1) if shape[-1:] == (E,) else a
 
     return jax.tree.map(one, numbers)
+
+
+def _density_of_parts(old: TetMesh, mesh: TetMesh, density: jax.Array) -> jax.Array:
+    """Return the density (V',) at the new nodes of quadratic elements.
+
+    Quadratic shape functions may be negative. So the density (V,) at the old nodes is interpolated linearly along the
+    edges of the parts, and then multiplied by the mean of one factor per element. The total mass does not change.
+    """
+    linear = on_middles(mesh, density)
+    parts = (element_density(mesh, linear) * mesh.volumes).reshape(-1, 8)
+    factor = element_density(old, density) * old.volumes / jnp.sum(parts, axis=1)
+    return linear * lumped_sums(mesh, jnp.repeat(factor, 8) * mesh.volumes) / nodal_volumes(mesh)
 
 
 def _law_of_parts(E: int, law: Law) -> Law:

@@ -15,6 +15,8 @@ from liverjax.waves.harmonic import relative_moduli
 #: Minimum number of element edges per wavelength of a shear wave. With fewer edges, even quadratic elements cannot
 #: describe a wave.
 _LEAST_PER_WAVE = 2.0
+#: The elements of a part have wavelengths that differ by less than this (logarithm).
+_ALIKE = 0.3
 
 
 def cautions_of_waves(scene: Scene, about: jax.Array | None = None) -> list[str]:
@@ -55,7 +57,8 @@ def cautions_of_waves(scene: Scene, about: jax.Array | None = None) -> list[str]
 def _of_short_waves(scene: Scene, hertz: np.ndarray) -> list[str]:
     """Return a warning if the shear waves at one of the frequencies (F,) [Hz] are too short for the elements.
 
-    The sizes in the warning are those of the shortest waves, and of the part of the body with these waves.
+    The parts of the body with waves of about the same length are judged by themselves (`_ALIKE`). The sizes in the
+    warning are those of the part with the fewest edges per wavelength.
     """
     if scene.body is None:
         return []
@@ -72,12 +75,15 @@ def _of_short_waves(scene: Scene, hertz: np.ndarray) -> list[str]:
     # The wave number of a shear wave is omega / speed. Its real part is 2 pi / wavelength.
     speeds = np.sqrt(factors * moduli / np.median(np.asarray(scene.body.density)))
     lengths = np.abs(speeds) ** 2 / np.maximum(speeds.real, np.finfo(float).tiny) / hertz[:, None]
-    shortest = lengths.min(axis=0)
-    length, at = float(shortest.min()), float(hertz[lengths.min(axis=1).argmin()])
-    edge = float(np.median(edges[shortest <= length * (1 + 1e-9)]))
+    found = []
+    for frequency, row in zip(hertz, lengths, strict=True):
+        parts = np.round(np.log(row) / _ALIKE)
+        for own in (parts == part for part in np.unique(parts)):
+            found.append((float(frequency), float(np.median(row[own])), float(np.median(edges[own]))))
+    at, length, edge = min(found, key=lambda of_part: of_part[1] / of_part[2])
     if length >= _LEAST_PER_WAVE * edge:
         return []
     return [
-        f"at {at:.3g} Hz shear waves are about {length:.2g} m long, and the edges of the elements are {edge:.2g} m "
+        f"at {at:.3g} Hz shear waves are about {length:.2g} m long where the edges of the elements are {edge:.2g} m "
         "long. The mesh is too coarse for these waves: use a finer mesh, or lower frequencies (see --mesh-error)"
     ]

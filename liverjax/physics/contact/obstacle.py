@@ -7,9 +7,9 @@ obstacle. There is no friction (see `liverjax.physics.contact.friction`). The en
 depth. The gradient and the second derivative of the energy are exact.
 
 With this penalty method the surface enters the obstacle. The depth is the pressure divided by `stiffness`. By default
-the stiffness is `HARDNESS` times the modulus of the body, divided by the size of a triangle. If the pressure is as
-large as this modulus, the depth is a hundredth of the triangle's size. `lj.obstacle_forces` returns the force and the
-maximum depth.
+the stiffness is `HARDNESS` times the modulus of the element at a triangle, divided by the size of the triangle. If the
+pressure is as large as this modulus, the depth is a hundredth of the triangle's size. `lj.obstacle_forces` returns the
+force and the maximum depth.
 
 Source: Wriggers 2006, Computational Contact Mechanics, chapters 5 and 6 (penalty, exact tangent).
 """
@@ -165,15 +165,17 @@ class Obstacle(Physics):
     def in_body(self, mesh: TetMesh, law: Law) -> "Obstacle":
         """Return the obstacle with a default stiffness from the law, if the user gave no stiffness.
 
-        The default is `HARDNESS` times the modulus K + 4/3 mu, divided by the size of the triangle. mu is the shear
-        modulus. The bulk modulus K is limited to 3 mu.
+        The default is `HARDNESS` times the modulus K + 4/3 mu of the element at the triangle, divided by the size of
+        the triangle. mu is the shear modulus. The bulk modulus K is limited to 3 mu.
         """
         if self.stiffness is not None:
             return self
         # Material under a contact can move sideways, so a large bulk modulus hardly stiffens it. Without the limit 3
         # mu, the contact would be much stiffer than the material.
         shear = law.shear_modulus()
-        modulus = jnp.max(jnp.asarray(jnp.minimum(law.bulk_modulus(), 3 * shear) + 4 / 3 * shear))
+        modulus = jnp.asarray(jnp.minimum(law.bulk_modulus(), 3 * shear) + 4 / 3 * shear)
+        if modulus.ndim:  # the largest modulus of each element, if it has several points
+            modulus = jnp.max(jnp.atleast_2d(modulus), axis=0)[surface.elements_of_faces(mesh, self.triangles)]
         return replace(self, stiffness=HARDNESS * modulus / jnp.sqrt(_triangle_areas(self, mesh)))
 
     def at_beginning(self) -> "Obstacle":
