@@ -271,3 +271,24 @@ def test_curves_of_one_sample_need_not_be_neighbours():
         errors.append(found.standard_errors[0])
         assert any("(estimated from 4 tests)" in told for told in found.warnings)
     assert errors[1] == pytest.approx(errors[0], rel=1e-6)
+
+
+def test_all_tests_of_one_sample_in_a_file_may_have_one_factor(tmp_path):
+    """Three samples with two tests each counted as six samples. The error of the modulus was a third of this error."""
+    rng, stretch, shear = np.random.default_rng(0), np.linspace(1.03, 1.3, 10), np.linspace(0.03, 0.3, 10)
+    files, (candidate,) = [], stress_stretch.candidates("neo_hookean")
+    for k, mu in enumerate((1000.0, 1300.0, 1100.0)):
+        tension = mu * (stretch - stretch**-2) * (1 + 0.01 * rng.standard_normal(10))
+        rows = [f"uniaxial,{x:.6f},,{P:.6g}" for x, P in zip(stretch, tension, strict=True)]
+        sheared = mu * shear * (1 + 0.01 * rng.standard_normal(10))
+        rows += [f"simple_shear,,{x:.6f},{P:.6g}" for x, P in zip(shear, sheared, strict=True)]
+        files.append(tmp_path / f"s{k}.csv")
+        files[-1].write_text("\n".join(["test,stretch,shear,nominal_stress_Pa", *rows]) + "\n")
+    by_file, _ = curves.read_curves(files)
+    of_one_sample = [c._replace(sample=c.file) for c in by_file]
+    of_tests = [c._replace(file="") for c in by_file]  # the program cannot know which tests belong together
+    own, same, other = (stress_stretch.fit(candidate, each, starts=2) for each in (by_file, of_one_sample, of_tests))
+    assert own.standard_errors[0] == pytest.approx(same.standard_errors[0], rel=1e-6)
+    assert own.standard_errors[0] > 2 * other.standard_errors[0]
+    assert any("(estimated from 3 files" in told for told in own.warnings)
+    assert any("(estimated from 6 tests)" in told for told in other.warnings)

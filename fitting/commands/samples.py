@@ -31,6 +31,9 @@ def run(options: argparse.Namespace) -> int:
     writable(options.out, ("fit.json", "fit.png", "fit.h5"))
     with named_bar(f"{len(sweeps)} samples") as told:
         found = samples.fit(sweeps, options.model, options.modes, told)
+    for path, sweep, corrected in zip(options.sweep, sweeps, found.sweeps, strict=True):
+        for note in corrected.notes[len(sweep.notes) :]:
+            print(f"note: {path.name}: {note}", file=sys.stderr)
     content = samples_report.write(options.out, found)
     print(samples_report.table(found))
     if options.cards:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.stats
 
-from fitting.fits import viscoelastic
+from fitting.fits import instrument, viscoelastic
 from fitting.fits.families import choice, models
 from fitting.fits.honesty import edges
 from fitting.fits.viscoelastic import Fit, Kind, information_criterion
@@ -22,7 +22,7 @@ from liverjax.core.errors import InputError
 class Samples(NamedTuple):
     """Fits of all samples with one model, and the population of each parameter of this model."""
 
-    sweeps: list[Sweep]
+    sweeps: list[Sweep]  # corrected for the error of the instrument's inertia, if it was found
     fits: list[Fit]
     populations: dict[str, Population | None]  # population of each parameter; names as in `values_of_sample`
     typical: Maxwell  # Prony modes of a typical sample, for a simulation
@@ -54,7 +54,8 @@ def fit(
     progress: Callable[[str], None] = lambda text: None,
 ) -> Samples:
     """Choose the model with the lowest sum of the information criteria of all samples. A model can be chosen only if at
-    least half of the samples determine all its parameters.
+    least half of the samples determine all its parameters. If a sweep contains the raw torque or the raw phase, its
+    Prony modes are then fitted again, together with the error of the inertia that the instrument subtracted.
 
     Args:
         sweeps: two or more samples.
@@ -88,12 +89,22 @@ def fit(
     able = [c for c in tried if c.able] or tried
     best = able[choice.preferred([choice.label_of(c.fits[0]) for c in able], [c.criterion for c in able])]
     progress("ends of the band")
-    fits = [edges.honest(f, s, d) for f, s, d in zip(best.fits, sweeps, dense, strict=True)]
+    checked = [_without_error_of_instrument(*own) for own in zip(best.fits, sweeps, dense, strict=True)]
+    fits, sweeps = [own for own, _ in checked], [own for _, own in checked]
     lowest = min(c.criterion for c in tried)
     rows = [c.label | {"above_the_lowest": c.criterion - lowest, "identifiable": c.able} for c in tried]
     compared = sorted(rows, key=lambda row: row["above_the_lowest"])
     populations = _populations(fits)
     return Samples(sweeps, fits, populations, _typical_sample(sweeps, fits, populations), compared)
+
+
+def _without_error_of_instrument(fit: Fit, sweep: Sweep, dense: Spectrum) -> tuple[Fit, Sweep]:
+    """Return the fit with the results of further checks (`edges.honest`), and the sweep. Both are corrected for the
+    error of the instrument's inertia, if the sweep has data of the instrument and the model has free Prony modes."""
+    fit, corrected = instrument.without_error_of_inertia(fit, sweep)
+    if corrected is not sweep:
+        dense = generalised_maxwell.spectrum(corrected)
+    return edges.honest(fit, corrected, dense), corrected
 
 
 def _candidate_for_all(sweeps: list[Sweep], fits: list[Fit], label: dict) -> _Candidate:

@@ -18,7 +18,7 @@ from fitting.methods.estimate import LOST, covering_root, errors_and_correlation
 from fitting.methods.generalised_maxwell import HOPELESS
 from fitting.methods.least_squares import Solution, levenberg_marquardt
 from fitting.methods.noise.alike_noise import Alike, along_rows
-from fitting.methods.noise.factor_noise import FactorNoise, factors_of_series
+from fitting.methods.noise.factor_noise import FactorNoise, factors_of_groups
 from fitting.methods.noise.uneven_noise import growing_root, uneven_root
 from fitting.readers.curves import Curve, check_curves
 from liverjax import laws
@@ -240,9 +240,9 @@ def _of_other_minima(
 OWN_FACTORS = "the stress of each test seems to be multiplied by an individual factor"
 
 
-def _of_noise(alike: Alike | None, factors: FactorNoise | None, n: int, tests: int) -> list[str]:
+def _of_noise(alike: Alike | None, factors: list[FactorNoise], n: int, tests: int) -> list[str]:
     """Return warnings about correlated noise of the n points, and about factors that multiply the stress of each
-    test."""
+    test. If both the factors of tests and those of files explain the residuals, the more probable ones are reported."""
     told = []
     if alike is not None:
         told.append(
@@ -250,22 +250,25 @@ def _of_noise(alike: Alike | None, factors: FactorNoise | None, n: int, tests: i
             f"calibration factor or offset of one test, or an inadequate law. The {n} points carry the information of "
             f"{alike.independent:.0f} independent points; the standard errors include this effect"
         )
-    if factors is not None and factors.shown:
+    own = max((f for f in factors if f.shown), key=lambda f: f.gain, default=None)
+    if own is not None:
+        source = "tests" if own.series == tests else "files, because all tests of a file seem to have the same factor"
         told.append(
-            f"{OWN_FACTORS}. These factors scatter by {100 * factors.deviation:.2g} %, for example due to different "
-            f"samples or wrong sizes of the samples. The standard errors contain this scatter (estimated from {tests} "
-            "tests)"
+            f"{OWN_FACTORS}. These factors scatter by {100 * own.deviation:.2g} %, for example due to different "
+            "samples or wrong sizes of the samples. The standard errors contain this scatter (estimated from "
+            f"{own.series} {source})"
         )
     return told
 
 
 def _of_hidden_factors(
-    factors: FactorNoise | None, names: np.ndarray, values: np.ndarray, errors: np.ndarray
+    every: list[FactorNoise], names: np.ndarray, values: np.ndarray, errors: np.ndarray
 ) -> list[str]:
     """Return a warning about factors that may multiply the stress of each test. The residuals do not show such factors,
     because the parameters compensate for these factors."""
-    if factors is None or factors.shown:
+    if not every or any(own.shown for own in every):
         return []
+    factors = every[0]
     much = (factors.moves > _HIDDEN * errors) & (factors.moves > _MOVED * np.abs(values))
     if not np.any(much):
         return []
@@ -284,10 +287,11 @@ def _errors_of_law(
     slope: np.ndarray,
     half: np.ndarray,
     of_tests: bool,
-) -> tuple[np.ndarray, np.ndarray, Alike | None, FactorNoise | None]:
+) -> tuple[np.ndarray, np.ndarray, Alike | None, list[FactorNoise]]:
     """Return the standard errors and the correlation of the P parameters, the noise that is correlated between
-    neighbouring points, and the factors that multiply the stress of each test. The errors and the correlation belong to
-    one covariance that covers the covariances for several kinds of noise (`covering_root`).
+    neighbouring points, and the factors that multiply the stress of each test, and of each file. A file may contain the
+    tests of one sample, or of several. The errors and the correlation belong to one covariance that covers the
+    covariances for several kinds of noise (`covering_root`).
 
     Args:
         curves: the fitted curves.
@@ -299,22 +303,20 @@ def _errors_of_law(
     """
     J, misfit, noise = residuals
     if not (np.all(np.isfinite(misfit)) and np.all(np.isfinite(half))):
-        return *errors_and_correlation(half), None, None
+        return *errors_and_correlation(half), None, []
     fitted = np.concatenate([c.stress / c.divisor for c in curves]) + misfit
     roots = [uneven_root(J, misfit, slope)]
     if of_tests:
         roots.append(growing_root(J, misfit, fitted, slope))
-    alike, factors, counts = None, None, [len(c.stress) for c in curves]
-    sample = np.repeat(np.unique([c.sample or c.label for c in curves], return_inverse=True)[1], counts)
+    alike, counts = None, [len(c.stress) for c in curves]
+    factors: list[FactorNoise] = []
+    groupings = [c.sample or c.label for c in curves], [c.file or c.sample or c.label for c in curves]
     if J.size and noise > EXACT:  # otherwise the residuals are roundoff
         alike = along_rows(counts, misfit, J, noise, np.linalg.pinv(J))
-        rows, each = np.argsort(sample, kind="stable"), np.bincount(sample).tolist()
-        factors = factors_of_series(each, J[rows], misfit[rows], fitted[rows], slope) if of_tests else None
+        factors = factors_of_groups(groupings, counts, J, misfit, fitted, slope) if of_tests else []
     if alike is not None:
         roots.append(slope @ alike.root)
-    if factors is not None:
-        roots.append(factors.root)
-    for root in roots:
+    for root in [*roots, *(own.root for own in factors)]:
         half = covering_root(half, np.clip(np.where(np.isfinite(root), root, LOST), -LOST, LOST))
     return *errors_and_correlation(half), alike, factors
 

@@ -39,6 +39,7 @@ class Curve(NamedTuple):
     returns: int = 0  # how often the deformation reverses and repeats earlier deformations
     sample: str = ""  # name of the sample, the same for all components of one test; if empty, `label`
     law_scale: float | None = None  # [Pa] root mean square of the stress of a fitted law; None: no law is fitted
+    file: str = ""  # path of the file, whose tests may all belong to one sample
 
     @property
     def driven(self) -> np.ndarray:
@@ -449,7 +450,8 @@ def _one_curve(file: Path, label: str, test: str, F: np.ndarray, component: tupl
     F[:, 2, 2] /= J
     driven = Curve(label, test, F, component, stress).driven
     order = np.argsort(driven, kind="stable")
-    return Curve(label, test, F[order], component, stress[order], _returns(driven, F.reshape(len(F), 9)))
+    returns = _returns(driven, F.reshape(len(F), 9))
+    return Curve(label, test, F[order], component, stress[order], returns, file=str(file))
 
 
 #: The deformation of a test reverses if it goes back by more than this fraction of its range.

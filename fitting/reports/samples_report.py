@@ -113,6 +113,7 @@ def _sample_entry(found: Samples, k: int) -> Content:
 #: Words in the warnings of single samples, and the sentence of the summary that counts these warnings.
 COUNTED = (
     ("mark of the instrument", "the instrument dominates the last points"),
+    ("not corrected", "an error of the instrument's inertia is not corrected"),
     ("Kramers-Kronig", "G' and G'' are not consistent with each other"),
     ("structured misfit", "the misfit has structure"),
     ("half decade", "some parameters depend on the ends of the band"),

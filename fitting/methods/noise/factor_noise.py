@@ -1,6 +1,7 @@
 """Standard errors of least squares if each series has an individual unknown factor, for example because the size of its
 sample is not exactly known."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -29,9 +30,40 @@ class FactorNoise(NamedTuple):
 
     deviation: float  # most probable standard deviation of a factor [1], may be 0; at most `HIDDEN` if not `shown`
     root: np.ndarray  # (P, n + K) square root of the covariance of the parameters
-    shown: bool  # whether the residuals show factors: independent noise alone does not explain them
+    series: int  # K
+    gain: float  # how much the factors raise the logarithm of the restricted likelihood
     hidden: float  # largest standard deviation of factors that the residuals do not exclude [1], at most `HIDDEN`
     moves: np.ndarray  # (P,) errors of the parameters due to factors with the standard deviation `hidden`
+
+    @property
+    def shown(self) -> bool:
+        """Whether the residuals show factors: independent noise alone does not explain the residuals."""
+        return self.gain >= _GAIN
+
+
+def factors_of_groups(
+    groupings: Sequence[list[str]],
+    counts: list[int],
+    J: np.ndarray,
+    r: np.ndarray,
+    fitted: np.ndarray,
+    slope: np.ndarray,
+) -> list[FactorNoise]:
+    """Return the noise of factors (`factors_of_series`) for each possible grouping of the curves. The curves of one
+    group have the same factor. Equal groupings are used once.
+
+    Args:
+        groupings: name of the group of each curve, for each grouping.
+        counts: number of rows of each curve.
+        J, r, fitted, slope: as for `factors_of_series`.
+    """
+    groups = [np.repeat(np.unique(names, return_inverse=True)[1], counts) for names in groupings]
+    out = []
+    for k, group in enumerate(groups):
+        if not any(np.array_equal(group, earlier) for earlier in groups[:k]):
+            rows = np.argsort(group, kind="stable")
+            out.append(factors_of_series(np.bincount(group).tolist(), J[rows], r[rows], fitted[rows], slope))
+    return [own for own in out if own is not None]
 
 
 def factors_of_series(
@@ -75,10 +107,11 @@ def factors_of_series(
     values, squares = np.array([at(q) for q in qs]).T
     best, levels, inverse = int(np.argmax(values)), np.sqrt(squares), np.linalg.pinv(J)
     by_factors = slope @ inverse @ F
-    shown = bool(values[best] - values[0] >= _GAIN)
+    gain = float(values[best] - values[0])
+    shown = gain >= _GAIN
     deviation = float(levels[best] * qs[best]) if shown else min(HIDDEN, float(levels[best] * qs[best]))
     few = float(scipy.special.stdtrit(K - 1, 0.975) / scipy.special.ndtri(0.975)) if shown else 1.0
     root = np.hstack([slope @ inverse * levels[best], by_factors * (deviation * few)])
     likely = values >= values[best] - _FALL
     hidden = HIDDEN if likely[-1] else min(HIDDEN, float((levels * qs)[likely].max()))
-    return FactorNoise(deviation, root, shown, hidden, hidden * np.linalg.norm(by_factors, axis=1))
+    return FactorNoise(deviation, root, K, gain, hidden, hidden * np.linalg.norm(by_factors, axis=1))
