@@ -132,3 +132,10 @@ def value_at(value: object, time: Number, times: Any, history: Any) -> Any:
         return value
     now = entry_at(time, times, history)
     return now if now.ndim else jnp.asarray(value, now.dtype) * now
+
+
+def integral_of(value: Number, begin: Number, end: Number, times: Numbers, history: Numbers) -> jax.Array:
+    """Return the time integral from `begin` to `end` [s] of `value` times the factor of its history."""
+    inside = jnp.clip(jnp.asarray(times), begin, end)
+    at = jnp.concatenate([jnp.atleast_1d(begin), inside, jnp.atleast_1d(end)]).astype(inside.dtype)
+    return jnp.asarray(value, inside.dtype) * jnp.trapezoid(jnp.interp(at, times, history), at)

@@ -26,7 +26,8 @@ ADVICE = {
     INVERTED: "equilibrium was reached, but with inverted elements, which are not physical: use smaller loads, a "
     "stiffer volumetric energy or a finer mesh",
     STEP_CUT: "the step was halved as often as allowed and still failed: use smaller steps or robust = 'projected'; if "
-    "a static body buckles or topples, use kind = 'dynamic'; if the body touches an obstacle, lower its stiffness",
+    "a static body buckles or topples, use kind = 'dynamic'; if the body touches an obstacle, give this obstacle a "
+    "lower stiffness",
     GRADIENT_UNCONVERGED: "a step did not converge, so the derivative is not the derivative of a solution: first "
     "change the run so that all steps converge (see Result.status)",
     ADJOINT_FAILED: "the linear solves of the derivative did not converge, and the derivative is not finite: use "

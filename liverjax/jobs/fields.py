@@ -12,7 +12,6 @@ import numpy as np
 
 from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Number
 from liverjax.elements.gradients import volume_gradients
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End
@@ -47,7 +46,7 @@ def check(names: list[str], scene: Scene) -> None:
         raise InputError("[output] fields contains fluid_velocity, which needs [porosity]: remove fluid_velocity")
 
 
-def fields(scene: Scene, result: Result, names: list[str], start: Number | None = None) -> dict[str, np.ndarray]:
+def fields(scene: Scene, result: Result, names: list[str], start: jax.Array | None = None) -> dict[str, np.ndarray]:
     """Return fields (T, E, …) of a finished run at T steps, as means over each element.
 
     The fields are cauchy_stress (3, 3) [Pa] including the fluid pressure, green_strain (3, 3), principal_stretches (3,)

@@ -67,10 +67,10 @@ def select(
 
 def _warn_of_millimetres(x: np.ndarray, key: str, bound: float, name: str) -> None:
     """Warn if a bound excludes no node and is far outside of the mesh, but would lie within it if it were in
-    millimetres. There is no warning of 1 m, with which people select everything."""
+    millimetres. A power of ten up to 1 m gives no warning, because people use it to select everything."""
     low, high = x.min(), x.max()
     idle = bound > high if key.endswith("max") else bound < low
-    far = abs(bound) > FAR_OUTSIDE * max(abs(low), abs(high)) and abs(bound) != 1
+    far = abs(bound) > FAR_OUTSIDE * max(abs(low), abs(high)) and abs(bound) not in (0.01, 0.1, 1.0)
     if idle and far and low < 1e-3 * bound < high:
         warnings.warn(
             f"{name}: {key} = {bound:g} m excludes no node, since the mesh spans {low:.4g} to {high:.4g} m. Bounds are "

@@ -244,11 +244,19 @@ def initial_fluid(porosity: Porosity, mesh: TetMesh) -> Fluid:
     return Fluid(jnp.full(mesh.number_of_vertices, start, J.dtype), J, J if porosity.scheme == "lagged" else None)
 
 
+def _volume_per_area(inlet: Inlet, time: Number, dt: Number) -> Number:
+    """Return the volume [m] that enters per reference area through an inlet with a flux, in a step (see `inflow`)."""
+    assert inlet.flux is not None
+    if inlet.history is None or inlet.times is None:
+        return dt * inlet.flux
+    return history.integral_of(inlet.flux, time - dt, time, inlet.times, inlet.history)
+
+
 def inflow(porosity: Porosity, mesh: TetMesh, time: Number, dt: Number) -> tuple[jax.Array, jax.Array]:
     """Return the given pressures (V,) [Pa] and the inflow (V,) [m^3] of a step, for `darcy.Flow`.
 
-    The step has the length dt [s] and ends at `time` [s]. The pressures are those at its end. A flux is linear within
-    a step, so the inflow is dt times the mean of the fluxes at the beginning and at the end of the step.
+    The step has the length dt [s] and ends at `time` [s]. The pressures are those at its end. The inflow is the time
+    integral of the flux over the step.
     """
     given = enters = jnp.zeros(mesh.number_of_vertices, mesh.points.dtype)
     for inlet in porosity.inlet:
@@ -256,8 +264,7 @@ def inflow(porosity: Porosity, mesh: TetMesh, time: Number, dt: Number) -> tuple
             given = given.at[inlet.nodes].set(inlet.at(inlet.pressure, time), mode="drop")
         else:
             normal = areas(mesh.points, inlet.triangles)
-            flux = 0.5 * (inlet.at(inlet.flux, time - dt) + inlet.at(inlet.flux, time))
-            volume = dt * flux * jnp.sqrt(jnp.sum(normal * normal, axis=1)) / 3
+            volume = _volume_per_area(inlet, time, dt) * jnp.sqrt(jnp.sum(normal * normal, axis=1)) / 3
             for a in range(3):
                 enters = enters.at[inlet.triangles[:, a]].add(volume)
     return given, enters

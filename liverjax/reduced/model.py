@@ -177,7 +177,8 @@ def refuse_unknown_physics(scene: Scene) -> None:
     by_element = scene.viscosity is not None and jnp.asarray(scene.viscosity.ratios).ndim == 2
     if by_element or any(region.viscosity for region in scene.region):
         raise InputError(
-            "a reduced model can have only one viscosity: give one series for the whole body, or run the full model"
+            "a reduced model can have only one viscosity: remove the viscosity of regions, give one series for the "
+            "whole body, or run the full model"
         )
     if len(laws_of(scene.law, scene.region)) > 1:
         raise InputError(

@@ -91,7 +91,7 @@ def joined_inlets(old: Scene, made: Porosity) -> tuple[Inlet, ...]:
     more = []
     for k, m in np.unique(ends, axis=1).T:
         own = node_numbers(new[(ends[0] == k) & (ends[1] == m)])
-        first, last = given[k][0], given[m][0]  # only `first` may be the drained nodes, because they have number 0
+        first, last = given[k][0], given[m][0]  # the drained nodes have number 0: if `last` is drained, both are
         if last is None:
             more.append(Inlet(nodes=own, pressure=0.0))
         elif first is None:

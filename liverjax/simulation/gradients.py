@@ -126,7 +126,7 @@ def memory(scene: Scene, store: str | int = "all") -> int:
         count, length, rest = gradient_checkpoints.lengths(steps, kept)
         stored, again = (count + (rest > 0)) * (state + tangent), length * (state + root)
     # There are two tangents: the tangent of a step, and the tangent of the beginning of the run. The run holds three
-    # arrays like the positions for each step, and reactions or pressures. The way back holds only the derivatives with
+    # arrays like the positions for each step, and the fluid pressures. The way back holds only the derivatives with
     # respect to the positions, and the work of one step.
     forward = stored + steps * (3 * positions + others) + 2 * tangent
     work = _WORK * scene.mesh.weights.size * scene.mesh.points.dtype.itemsize

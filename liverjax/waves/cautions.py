@@ -57,7 +57,7 @@ def cautions_of_waves(scene: Scene, about: jax.Array | None = None) -> list[str]
 def _of_short_waves(scene: Scene, hertz: np.ndarray) -> list[str]:
     """Return a warning if the shear waves at one of the frequencies (F,) [Hz] are too short for the elements.
 
-    The parts of the body with waves of about the same length are judged by themselves (`_ALIKE`). The sizes in the
+    The parts of the body with waves of about the same length are checked separately (`_ALIKE`). The sizes in the
     warning are those of the part with the fewest edges per wavelength.
     """
     if scene.body is None:
