@@ -15,6 +15,7 @@ from conftest import COMPILED
 import liverjax as lj
 from fitting.__main__ import main
 from fitting.fits import stress_stretch
+from fitting.fits.families import hyperelastic
 from fitting.readers import curves
 from fitting.reports import curves_report
 from liverjax.laws import homogeneous
@@ -105,6 +106,52 @@ def test_a_law_of_ones_own_is_fitted_from_its_file(tmp_path, capsys):
     assert "is not an isochoric energy plus U(J)" in capsys.readouterr().err
     assert main(["curves", f"{file}:Gnt", str(DATA / "rubber_curves.csv")]) == 2
     assert f"has no Gnt: use {file}:Gent or {file}:Blatz" in capsys.readouterr().err
+
+
+WITHOUT_BULK = """
+import jax.numpy as jnp
+import liverjax as lj
+
+@lj.struct
+class Mine(lj.Law):
+    c: float = lj.param("Pa", above=0.0, typical=400.0)
+    beta: float = lj.param("Pa", lower=0.0, typical=100.0)
+
+    def isochoric_energy(self, I1, I2):
+        return self.c * (I1 - 3) + self.beta * (I1 - 3) ** 2
+
+@lj.struct
+class Power(lj.Law):
+    c: float = lj.param("Pa", above=0.0, typical=400.0)
+    alpha: float = lj.param("1", above=0.0, typical=1.2)
+
+    def isochoric_energy(self, I1, I2):
+        return self.c * ((I1 - 2) ** self.alpha - 1)
+"""
+
+
+def test_a_law_without_a_bulk_modulus_is_fitted(tmp_path):
+    """The fit failed for a law without a field `bulk`, and it did not report values that scenes refuse."""
+    (tmp_path / "mine.py").write_text(WITHOUT_BULK)
+    (candidate,) = stress_stretch.candidates(f"{tmp_path}/mine.py:Mine")
+    truth = lj.laws.Yeoh(c1=350.0, c2=-30.0, c3=0.0, bulk=None)
+    found = stress_stretch.fit(candidate, synthetic(truth)[:1], starts=4)
+    assert np.allclose(found.values, [350.0, -30.0], rtol=1e-5)
+    (told,) = [w for w in found.warnings if "bounds" in w]
+    assert told.startswith("beta = -30 is out of the bounds of the law")
+    twice = [*found.values, 350.0, 30.0]
+    own = candidate._replace(names=("0.c", "0.beta", "1.c", "1.beta"), fields=candidate.fields * 2)
+    assert len(hyperelastic.out_of_bounds(own, np.array(twice), {})) == 1
+    assert not hyperelastic.out_of_bounds(own, np.array(twice), {"0.beta": "0"})
+
+
+def test_a_positive_exponent_starts_near_its_typical_value(tmp_path):
+    """A parameter alpha that must be positive started at exp(u), with u up to 30 and down to -30."""
+    (tmp_path / "mine.py").write_text(WITHOUT_BULK)
+    (candidate,) = stress_stretch.candidates(f"{tmp_path}/mine.py:Power")
+    starts = candidate.random(np.random.default_rng(0), 128)
+    alpha = np.stack([candidate.values(u, 800.0) for u in starts])[:, 1]
+    assert 0.9 < np.median(alpha) < 1.6 and alpha.min() > 0.01 and alpha.max() < 1000
 
 
 SEVERAL = """

@@ -17,7 +17,7 @@ from liverjax.core.struct import replace
 from liverjax.mesh import promotion
 from liverjax.mesh.shape_functions import basis
 from liverjax.physics.volumes import mixed
-from liverjax.simulation import tangent
+from liverjax.simulation import mesh_error, tangent
 from liverjax.simulation.equations import equations, initial_state, positions, residual, settled, unknowns
 from liverjax.simulation.run import prepared, simulate_part
 from liverjax.simulation.step import problem_of
@@ -383,6 +383,26 @@ def test_a_robust_step_of_a_mixed_body(order):
     assert int(least.code) == 0
     assert np.abs(positions(e, least.q, 1.0) - followed.positions[-1]).max() < 1e-7 * far
     assert np.abs(lj.simulate(scene).check().positions[-1] - followed.positions[-1]).max() < 1e-7 * far
+
+
+@lj.struct
+class _WithoutModuli(lj.Law):
+    mu: float = lj.param("Pa", typical=770.0)
+    bulk: float = lj.param("Pa", typical=7700.0)
+    volumetric: str = lj.static("quadratic")
+
+    def isochoric_energy(self, I1, I2):
+        return self.mu / 2 * (I1 - 3)
+
+
+def test_mixed_needs_the_moduli_of_the_law():
+    """For a law without `shear_modulus`, "auto" chose pressures as unknowns, and then the run raised an error."""
+    scene = replace(_cook(2, 1, 10.0, volumetric="mixed"), law=_WithoutModuli(mu=770.0, bulk=7700.0))
+    with pytest.raises(lj.InputError, match=r"no ground-state shear modulus: define shear_modulus\(self\)"):
+        lj.check_scene(scene)
+    assert prepared(replace(scene, solve=lj.Solve(volumetric="auto"))).solve.volumetric == "element"
+    linear = replace(_cook(1, 1, 10.0), law=scene.law)  # the estimate of the mesh error uses richer elements
+    assert mesh_error.richer(linear).scene.solve.volumetric == "element"
 
 
 def test_mixed_refuses_what_it_cannot_be():

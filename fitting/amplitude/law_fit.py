@@ -146,9 +146,8 @@ def with_loss_tangent(candidate: Candidate) -> Candidate:
     def random(rng: np.random.Generator, n: int) -> np.ndarray:
         return np.column_stack([candidate.random(rng, n), rng.uniform(0.05, 0.5, n)])
 
-    return candidate._replace(
-        names=(*candidate.names, "loss_tangent"), units=(*candidate.units, "1"), values=values, law=law, random=random
-    )
+    names, units, fields = (*candidate.names, "loss_tangent"), (*candidate.units, "1"), (*candidate.fields, {})
+    return candidate._replace(names=names, units=units, fields=fields, values=values, law=law, random=random)
 
 
 def _as_curves(sweep: StrainSweep) -> list[Curve]:

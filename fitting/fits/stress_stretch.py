@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 
-from fitting.fits.families.hyperelastic import Candidate, ground_state_modulus
+from fitting.fits.families.hyperelastic import Candidate, ground_state_modulus, out_of_bounds
 from fitting.fits.families.hyperelastic import candidates as candidates  # users import it from this module
 from fitting.fits.honesty.other_minima import of_other_minima
 from fitting.fits.viscoelastic import EXACT
@@ -212,7 +212,7 @@ def assessed(
         compile_time=times[1],
         limits=limits,
     )
-    told = _warnings(result, curves, s, bool(np.any(r[n:] < 0)))
+    told = _warnings(result, curves, s, bool(np.any(r[n:] < 0))) + out_of_bounds(candidate, values, limits)
     told += _of_noise(alike, factors, n, len({c.sample or c.label for c in curves}))
     told += _of_hidden_factors(factors, np.array(candidate.names)[known], values[known], errors[known])
     if of_tests and not limits:

@@ -1,6 +1,6 @@
 """Hyperelastic laws as families of models: the parameters to be fitted, and starting points for the fit."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax import laws
+from liverjax.core import bounds
 from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
 from liverjax.laws import Law, gradient_check
@@ -24,6 +25,7 @@ class Candidate(NamedTuple):
     law: Callable[[jax.Array], Law]  # parameters -> law without volumetric energy
     random: Callable[[np.random.Generator, int], np.ndarray]  # (generator, n) -> n random starting points (n, len(u))
     notes: tuple[str, ...] = ()  # notes about parameters that are not fitted
+    fields: tuple[Mapping, ...] = ()  # metadata of the parameters, with their bounds
 
 
 def candidates(name: str, terms: int | None = None) -> list[Candidate]:
@@ -83,6 +85,7 @@ def _sum(label: str, parts: list[Candidate]) -> Candidate:
         law,
         random,
         tuple(note for p in parts for note in p.notes),
+        tuple(metadata for p in parts for metadata in p.fields),
     )
 
 
@@ -108,15 +111,38 @@ def _single(label: str, typical: Law) -> Candidate:
     def random(rng, n):
         near = np.log(np.abs(middle)) + 1.5 * rng.standard_normal((n, len(names)))
         u = np.where(positive, near, middle * np.exp(rng.standard_normal((n, len(names)))))
-        # An exponent alpha may be positive or negative. The other parameters without a bound are coefficients and keep
-        # their signs.
-        alpha = np.array([m == "alpha" for m in names])
+        # An exponent alpha may be positive or negative, unless its bound is 0. The other parameters without this bound
+        # are coefficients and keep their signs.
+        alpha = np.array([m == "alpha" for m in names]) & ~positive
         return np.where(alpha, _exponents_of_law(rng, (n, len(names))), u)
 
     def law(p):
-        return replace(typical, **dict(zip(names, p, strict=True)), bulk=None)
+        return replace(typical, **dict(zip(names, p, strict=True))).isochoric_part()
 
-    return Candidate(label, names, tuple("Pa" if m else "1" for m in modulus), values, law, random, notes)
+    units = tuple("Pa" if m else "1" for m in modulus)
+    return Candidate(label, names, units, values, law, random, notes, tuple(f.metadata for f in fields))
+
+
+def out_of_bounds(candidate: Candidate, values: np.ndarray, limits: Collection[str]) -> list[str]:
+    """Return a warning for each fitted value that the bounds of its parameter do not allow. The fit considers only the
+    bound `above=0`.
+
+    Args:
+        candidate: the fitted law.
+        values: the values (p,) of its parameters.
+        limits: names of the parameters that went to a limit. They already have a warning.
+    """
+    told = []
+    for name, value, metadata in zip(candidate.names, values.tolist(), candidate.fields, strict=True):
+        try:
+            bounds.check_bound(name, metadata, value)
+        except InputError:
+            if name not in limits:
+                told.append(
+                    f"{name} = {value:.4g} is out of the bounds of the law, so scenes refuse it: use a law without "
+                    "this parameter, or change the bounds of the law"
+                )
+    return told
 
 
 def _fitted(label: str, law: Law) -> tuple[list, tuple[str, ...]]:
@@ -187,7 +213,8 @@ def _ogden(terms: int) -> Candidate:
         return laws.Ogden(mu=tuple(p[:terms]), alpha=tuple(p[terms:]), bulk=None)
 
     label = f"ogden, {terms} term{'s' if terms > 1 else ''}"
-    return Candidate(label, names, ("Pa",) * terms + ("1",) * terms, values, law, partial(_ogden_starts, terms=terms))
+    units, starts = ("Pa",) * terms + ("1",) * terms, partial(_ogden_starts, terms=terms)
+    return Candidate(label, names, units, values, law, starts, fields=({},) * (2 * terms))
 
 
 def _bogen() -> Candidate:

@@ -42,8 +42,8 @@ def check_mixed_laws(several: Sequence[Law], name: str = "[solve] volumetric = '
     """Check that pressures can be unknowns with the laws of a body.
 
     Raises:
-        InputError: a law has no isochoric part or no bulk modulus, or is continued below a volume ratio, or the laws
-            have different kinds of volumetric energy.
+        InputError: a law has no isochoric part, no volumetric part, no shear modulus or no bulk modulus, or is
+            continued below a volume ratio, or the laws have different kinds of volumetric energy.
     """
     kinds = set()
     for law in several:
@@ -58,6 +58,8 @@ def check_mixed_laws(several: Sequence[Law], name: str = "[solve] volumetric = '
             raise InputError(
                 f"{name} cannot be used with continued_below: remove continued_below, or use 'element' or 'nodal'"
             )
+        law.shear_modulus()  # `MixedVolume` needs both moduli: a law that lacks one of them raises an error here
+        law.bulk_modulus()
         kinds |= {part.volumetric for part in parts}
     if len(kinds) != 1:
         raise InputError(
