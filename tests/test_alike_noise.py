@@ -1,9 +1,17 @@
 """Standard errors of parameters if the noise of neighbouring points is correlated."""
 
+from types import SimpleNamespace
+
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from fitting.fits import scene_numbers
+from fitting.methods.estimate import estimated
+from fitting.methods.least_squares import Solution
 from fitting.methods.noise.alike_noise import alike_noise, along_rows
+from fitting.readers.displacements import Displacements
+from fitting.reports import field_report
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -157,3 +165,20 @@ def test_two_series_that_drift_are_seen_and_white_ones_are_not():
             found = along_rows([30, 30], r, J, float(np.sqrt(r @ r / 58)), np.linalg.pinv(J))
             seen[kind] += found is not None
     assert seen["white"] <= 1 and seen["stretch"] <= 1 and seen["drift"] >= 16, seen
+
+
+def test_the_warning_about_correlated_noise_is_in_the_report():
+    """The warning was printed, but field.json did not contain it."""
+    X = points()
+    n, J, noise = len(X), fields(X), np.random.default_rng(1).standard_normal((len(X), 3))
+    u, r = fitted((smoothed(X, 0.01) @ noise).ravel(), J)
+    corner = np.eye(4)[np.zeros(n, int)]
+    data = Displacements(
+        np.zeros(n, int), np.arange(n)[:, None].repeat(4, 1), corner, np.zeros((n, 3)), np.ones((n, 3))
+    )
+    problem = SimpleNamespace(scenes=(SimpleNamespace(mesh=SimpleNamespace(points=X)),), data=(data,))
+    minimum = Solution(jnp.asarray(u), r, J, r @ r / 2, 1, 0.0, True)
+    estimate = estimated(("a", "b"), lambda u: u, minimum, 3 * n)
+    with pytest.warns(UserWarning, match="residuals of points") as told:
+        found = scene_numbers._of_alike_noise(problem, lambda u: u, minimum, estimate)
+    assert str(told[0].message) in field_report.of_numbers(found)["warnings"]

@@ -40,6 +40,23 @@ def test_a_fit_that_misses_the_data_says_so():
     assert said is not None and said.startswith("no values of law.mu explain the displacements")
 
 
+def test_the_warnings_about_a_map_are_in_its_content():
+    """field.json had no warnings about a map: they were only printed. The deviation of the level was not written."""
+    mesh = lj.shapes.box((1.0, 1.0, 1.0), (1, 1, 1))
+    n, E = mesh.number_of_nodes, mesh.number_of_elements
+    ones = np.ones(n)
+    found = field.Field(
+        *("law.mu", 0 * ones, np.ones(E), 0.3 * ones, ones, 0.4 * ones, None, 0.1, 0.02, 500.0, 240, False, 2.0),
+        *([], np.ones(3), (0,), 1.0, np.zeros(E, bool), 9.0),
+    )
+    content = field_report.of_field(mesh, found)
+    assert content["standard_deviation_of_level_of_ln"] == 9.0
+    for said, words in zip(
+        content["warnings"], ("chi2 stays at", "the search stopped", "level of the map", "mesh"), strict=True
+    ):
+        assert words in said
+
+
 @pytest.mark.parametrize(
     ("sd", "bias", "level", "mesh"),
     [

@@ -8,7 +8,8 @@ from conftest import SHARED
 
 from fitting.__main__ import main
 from fitting.fits.families import models
-from fitting.master import master_curve, shifts, temperature_laws, temperature_sweeps
+from fitting.master import master_curve, master_report, shifts, temperature_laws, temperature_sweeps
+from fitting.readers import rheometer
 from fitting.readers.frequency_sweep import Sweep
 from fitting.reports import one_page
 from liverjax.core.errors import InputError
@@ -437,3 +438,16 @@ def test_missing_factors_and_missing_deviations_are_told(tmp_path):
     one, other, *_ = sweeps(0.0)
     both = temperature_sweeps.joined([one._replace(storage_sd=one.storage, loss_sd=one.loss), other])
     assert both.storage_sd is None and "the standard deviations are not used" in both.notes[0]
+
+
+@pytest.mark.parametrize("estimated", [False, True])
+def test_a_master_curve_keeps_the_measured_deviations(tmp_path, estimated):
+    """The file had no deviations. A fit of the file then had other weights, and errors up to 4 times different."""
+    own = [s._replace(storage_sd=0.03 * s.storage, loss_sd=0.01 * s.loss) for s in sweeps(0.0)[2:5]]
+    own = [s._replace(sd_estimated=estimated) for s in own]
+    found = master_curve.master_curve(temperature_sweeps.AtTemperatures(own, TEMPERATURES[2:5], None), None)
+    master_report.write_master_curve(tmp_path, found)
+    again = rheometer.read_sweep(tmp_path / "master_curve.csv")
+    assert (again.storage_sd is None) == estimated
+    if not estimated:
+        assert np.allclose(again.storage_sd, 0.03 * again.storage) and np.allclose(again.loss_sd, 0.01 * again.loss)

@@ -127,6 +127,28 @@ def test_the_card_of_sofa_is_the_equilibrium(tmp_path):
     assert numbers == "0.235 0.27; 0.333 0.03"
 
 
+@pytest.mark.parametrize(("error", "solid"), [(0.2, True), (0.26, False), (np.inf, False)])
+def test_the_card_of_sofa_has_stiffness_if_the_model_may_be_a_fluid(tmp_path, error, solid):
+    """The card contained 0.46 ± 0.26 Pa, the equilibrium modulus of a fluid of 1100 Pa, without a note."""
+    model = Maxwell(np.array(1100.0), np.array([0.6, 0.4 - 0.456 / 1100]), np.array([0.5, 0.03]))
+    told = material_cards.write(tmp_path, model, error)
+    shear = float(re.search(r'ParameterSet="(\S+)', (tmp_path / "sofa.xml").read_text())[1])
+    assert shear == pytest.approx(0.456 if solid else 1100)
+    assert told == [] if solid else "within the error of the fit (equilibrium modulus 0.456 Pa)" in told[0]
+
+
+def test_the_command_gives_the_error_of_the_equilibrium_modulus_to_the_cards(tmp_path, capsys):
+    noise = 1 + 0.005 * np.random.default_rng(3).standard_normal((2, 20))
+    omega = 2 * np.pi * np.geomspace(0.1, 20, 20)
+    G = complex_modulus(0.0, [660.0, 440.0], [0.5, 0.03], omega)
+    rows = [f"{w},{p},{q}" for w, p, q in zip(omega, G.real * noise[0], G.imag * noise[1], strict=True)]
+    (tmp_path / "s.csv").write_text("\n".join(["angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa", *rows]))
+    command = [str(tmp_path / "s.csv"), "--method", "closed-form", "--modes", "2", "--cards"]
+    assert main([*command, "--out", str(tmp_path / "out")]) == 0
+    told = capsys.readouterr().err
+    assert "cannot be distinguished from zero (a fluid)" in told and "the card for SOFA contains G0 = 1100 Pa" in told
+
+
 def test_the_command_writes_them(tmp_path, capsys):
     file = ROOT / "data" / "porcine_liver_frequency_sweep.csv"
     assert main([str(file), "--method", "closed-form", "--modes", "2", "--cards", "--out", str(tmp_path)]) == 0

@@ -9,11 +9,11 @@ import pytest
 
 import liverjax as lj
 from fitting import __main__ as command
-from fitting.fits import instrument
+from fitting.fits import instrument, viscoelastic
 from fitting.fits.families import models
 from fitting.fits.honesty.long_times import INTERVAL
 from fitting.fits.simulated_rheometer import Simulation, rig_of
-from fitting.methods import generalised_maxwell
+from fitting.methods import generalised_maxwell, uncertainty
 from fitting.methods.generalised_maxwell import Maxwell, weighed
 from fitting.readers.frequency_sweep import Sweep
 from fitting.reports import sweep_report
@@ -322,6 +322,21 @@ def test_a_compressed_fluid_has_no_axial_force_after_relaxation(law):
     assert told["axial_force_N"] == 0 and told["axial_force_at_once_N"] is None
     springpot.details["precompression"] = told
     assert sweep_report._compression([springpot])[1].endswith(": 0 N (smooth plates)")
+
+
+def test_the_force_of_prony_modes_that_add_up_to_a_fluid_has_a_finite_error(law):
+    """The line said "0 ± inf N". The interval of the equilibrium modulus was known."""
+    fluid = Maxwell(np.float64(1100.0), np.array([0.6, 0.4]), np.array([0.5, 0.03]))
+    omega, noise = 2 * np.pi * np.geomspace(0.1, 20, 20), 0.005 * np.random.default_rng(0).standard_normal((2, 20))
+    storage, loss = (1 + noise) * np.stack(generalised_maxwell.moduli(fluid, omega))
+    fit = viscoelastic.closed_form(Sweep(omega, storage, loss), 2)
+    assert fit.kind.name == "prony" and np.isinf(uncertainty.equilibrium_error(fit.uncertainty))
+    fit.details[INTERVAL] = {"low": 0.0, "high": 1.96, "wider_than_standard_error": False}
+    fit.details["precompression"] = told = instrument.compression_numbers(fit, Simulation(precompression=STRAIN))
+    one_Pa = compression.smooth_force(law, STRAIN, 0.01) / float(law.shear_modulus())
+    assert told["axial_force_standard_error_N"] is None
+    assert told["axial_force_total_error_N"] == pytest.approx(one_Pa)
+    assert "inf" not in sweep_report._compression([fit])[1]
 
 
 def test_the_inertia_of_a_compressed_sample_is_that_of_its_mass(tmp_path, law):

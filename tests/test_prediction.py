@@ -59,6 +59,20 @@ def test_errors_of_a_sweep_with_deviations_are_relative_to_its_moduli():
     assert "within 9.1 % on average" in prediction.sentence(found)
 
 
+def test_the_interval_of_the_prediction_has_the_quantile_of_the_fit():
+    """The interval had 1.96 standard errors of the fit. From four frequencies, it contained 89 % of the truth."""
+    one, omega = Maxwell(np.float64(800.0), np.array([0.6]), np.array([1.0])), np.geomspace(0.3, 5, 4)
+    noise = 1 + 0.02 * np.random.default_rng(0).standard_normal((2, 4))
+    G = generalised_maxwell.moduli(one, omega)
+    s = Sweep(omega, G[0] * noise[0], G[1] * noise[1])
+    fit = viscoelastic.closed_form(s, 1)
+    found = prediction.predict(fit, s.resolved, s)
+    assert fit.uncertainty.quantile == pytest.approx(2.571, abs=1e-3)  # 8 values, 3 parameters
+    for factor, covered in ((2.5, 1.0), (2.6, 0.0)):
+        off = found._replace(measured=found.predicted + factor * found.standard_errors, noise=np.zeros(8))
+        assert off.covered == covered
+
+
 @pytest.mark.ci
 def test_a_stiffer_sample_is_a_factor_and_waves_are_predicted_too():
     s = sweep(0.0, 0)

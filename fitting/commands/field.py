@@ -139,10 +139,7 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     kinds = dict.fromkeys(("mesh", *beside[0]))
     sizes = {f"{kind}_error_over_noise": [each.get(kind, np.nan) for each in beside] for kind in kinds}
     content = _files(options) | {"map": field_report.of_field(mesh, found) | sizes}
-    _warn(field_report.noise_sentence(found))
-    _warn(field.distance_sentence(found))
-    _warn(field.level_sentence(found))
-    for sentence in field.map_bias_sentences(found):
+    for sentence in field_report.map_sentences(found):
         _warn(sentence)
     if options.sphere:
         sphere = inclusion.estimate(problem, name, inclusion.start_from(problem, found))

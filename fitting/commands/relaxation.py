@@ -140,7 +140,7 @@ def run(options: argparse.Namespace) -> int:
 
         print(posterior_report.table(posterior))
     if options.cards:
-        shared_options.write_cards(out, found.model)
+        shared_options.write_cards(out, found.model, found.uncertainty)
     for sentence in content["warnings"]:
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"written: {out}/fit.json, fit.png")

@@ -14,6 +14,7 @@ from liverjax.core.errors import InputError
 if TYPE_CHECKING:
     from fitting.fits.stress_stretch import LawFit
     from fitting.fits.viscoelastic import Kind
+    from fitting.methods.estimate import Estimate
     from fitting.methods.generalised_maxwell import Maxwell
     from fitting.readers.frequency_sweep import Sweep
 
@@ -84,11 +85,14 @@ def has_draws(kind: "Kind") -> bool:
     return False
 
 
-def write_cards(out: Path, model: "Maxwell") -> None:
-    """Write material cards, and print notes on everything that a program cannot represent."""
+def write_cards(out: Path, model: "Maxwell", of_fit: "Estimate | None" = None) -> None:
+    """Write material cards, and print notes on everything that a program cannot represent. `of_fit`: the fitted Prony
+    modes with their errors, if they are known."""
+    from fitting.methods.uncertainty import equilibrium_error
     from fitting.reports import material_cards
 
-    for sentence in material_cards.write(out / "cards", model):
+    error = 0.0 if of_fit is None else equilibrium_error(of_fit)
+    for sentence in material_cards.write(out / "cards", model, error):
         print(f"note: {sentence}", file=sys.stderr)
     print(f"written: {out}/cards")
 

@@ -189,7 +189,7 @@ def run(options: argparse.Namespace) -> int:
 
         print(posterior_report.table(posterior))
     if options.cards:
-        shared_options.write_cards(options.out, fits[-1].model)
+        shared_options.write_cards(options.out, fits[-1].model, fits[-1].uncertainty)
     if options.report:
         from fitting.reports import one_page
 

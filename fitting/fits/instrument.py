@@ -498,7 +498,7 @@ def _equilibrium_errors(fit: Fit) -> tuple[float | None, float | None]:
     """Return the standard error and the total error [Pa] of the equilibrium modulus; None: unknown. The total error of
     a fluid is the upper end of the 95 % interval, converted to a standard deviation."""
     total, interval = total_error.total_errors(fit).get("equilibrium_modulus"), fit.details.get(INTERVAL)
-    if total is None:
+    if total is None or (interval and not np.isfinite(total)):
         return None, interval["high"] / NORMAL if interval else None
     if fit.parameters is None:
         return uncertainty.equilibrium_error(fit.uncertainty), total

@@ -180,14 +180,15 @@ def _of_alike_noise(problem: Problem, natural_of: Callable, found: Solution, est
     most = float(np.max(errors / estimate.standard_errors))
     if most < 1:
         return estimate
-    warnings.warn(
+    sentence = (
         f"residuals of points within {alike.length:.2g} m are correlated: the measured field was smoothed, or the "
         f"scene is inadequate. The standard errors include this correlation, and are up to {most:.2g} times those "
-        "for independent noise",
-        stacklevel=3,
+        "for independent noise"
     )
+    warnings.warn(sentence, stacklevel=3)
     errors = np.maximum(errors, estimate.standard_errors)
-    return estimate._replace(root=root, standard_errors=errors, correlation=correlation)
+    told = (*estimate.warnings, sentence)
+    return estimate._replace(root=root, standard_errors=errors, correlation=correlation, warnings=told)
 
 
 #: If there are at least this many measured components per parameter, the residuals show whether the noise differs

@@ -11,18 +11,24 @@ from liverjax.core.files import write_rows
 from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save
 
 HEAD = "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa"
+#: Names of the columns that are added if standard deviations were measured.
+SD_HEAD = "storage_modulus_sd_Pa,loss_modulus_sd_Pa"
 
 
 def write_master_curve(out: Path, found: MasterCurve) -> None:
-    """Write shift_factors.csv, master_curve.csv and shift.png to the folder `out`."""
+    """Write shift_factors.csv, master_curve.csv and shift.png to the folder `out`. The file master_curve.csv contains
+    the standard deviations of the moduli if they were measured."""
     out.mkdir(parents=True, exist_ok=True)
     s = found.shifts
     rows = [celsius(s.temperatures), 10**s.log_a, s.log_a_errors, 10**s.log_b, s.log_b_errors, s.misfit]
     head = "temperature_C,shift_factor,sd_of_log10_shift_factor,vertical_factor,sd_of_log10_vertical_factor,distance"
     write_rows(out / "shift_factors.csv", np.column_stack(rows), head, "%.8g")
-    whole = found.sweep
+    whole, names = found.sweep, HEAD
     columns = [whole.angular_frequency / (2 * np.pi), whole.storage, whole.loss]
-    write_rows(out / "master_curve.csv", np.column_stack(columns), HEAD, "%.10g")
+    weights = any(part.sd_estimated or part.sd_before for part in found.parts)
+    if whole.storage_sd is not None and whole.loss_sd is not None and not weights:
+        columns, names = [*columns, whole.storage_sd, whole.loss_sd], f"{HEAD},{SD_HEAD}"
+    write_rows(out / "master_curve.csv", np.column_stack(columns), names, "%.10g")
     save(shift_figure(found), out / "shift.png")
 
 

@@ -38,6 +38,7 @@ class Estimate(NamedTuple):
     time_step_bias: np.ndarray | None = None  # (P,) error of the values due to the time steps
     shared: np.ndarray | None = None  # (P, s) columns of `root`: errors common to all points (gap, instrument)
     mesh_over_noise: float | None = None  # root mean square of the mesh error, divided by the noise
+    warnings: tuple[str, ...] = ()  # warnings of the fit that do not follow from the other numbers
 
     @property
     def covariance(self) -> np.ndarray:

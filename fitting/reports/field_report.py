@@ -8,7 +8,7 @@ import h5py
 import jax.numpy as jnp
 import numpy as np
 
-from fitting.fits.field import Field
+from fitting.fits.field import Field, distance_sentence, level_sentence, map_bias_sentences
 from fitting.methods.estimate import Estimate, bias_sentences
 from fitting.readers.displacements import locate
 from fitting.reports.sweep_report import numbers
@@ -82,8 +82,15 @@ def noise_sentence(found: Field) -> str | None:
     )
 
 
+def map_sentences(found: Field) -> list[str]:
+    """Return all warnings about a map."""
+    first = (noise_sentence(found), distance_sentence(found), level_sentence(found))
+    return [*(sentence for sentence in first if sentence is not None), *map_bias_sentences(found)]
+
+
 def of_numbers(found: Estimate, with_mesh: bool = False) -> Content:
     """Return the content of field.json for a few parameters. `with_mesh`: see `misfit_sentence`."""
+    sentences = (misfit_sentence(found, with_mesh), *found.warnings, *bias_sentences(found))
     return {
         "values": dict(zip(found.names, found.values.tolist(), strict=True)),
         "standard_errors": dict(zip(found.names, found.standard_errors.tolist(), strict=True)),
@@ -98,7 +105,7 @@ def of_numbers(found: Estimate, with_mesh: bool = False) -> Content:
         "iterations": found.iterations,
         "converged": found.converged,
         "status": [NAMES[c] for c in found.codes],
-        "warnings": [sentence for sentence in (misfit_sentence(found, with_mesh), *bias_sentences(found)) if sentence],
+        "warnings": [sentence for sentence in sentences if sentence],
         "run_time_s": found.seconds,
     }
 
@@ -136,8 +143,10 @@ def of_field(mesh: TetMesh, found: Field) -> Content:
         "distance_to_minimum_in_standard_deviations": found.distance,
         "components": found.components,
         "directions_known": int(np.sum(found.eigenvalues > 1)),
+        "standard_deviation_of_level_of_ln": found.level_sd,
         "history": found.history,
         "status": [NAMES[c] for c in found.codes],
+        "warnings": map_sentences(found),
         "run_time_s": found.seconds,
     }
 

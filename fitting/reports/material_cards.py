@@ -1,15 +1,16 @@
 """Write Prony modes as material cards for liverjax, FEBio, Abaqus, Ansys and SOFA, in SI units (m, kg, s, Pa).
 
 All cards contain a neo-Hookean law. Its shear modulus is the instantaneous modulus G0; only the card for SOFA, which
-has no Prony series, contains the equilibrium modulus (for a fluid: G0). The whole stress relaxes, as in the simulations
-here (part = "all"). A shear test does not determine the bulk modulus. The bulk modulus is computed from Poisson's ratio
-`POISSON`.
+has no Prony series, contains the equilibrium modulus. If the equilibrium modulus cannot be distinguished from zero (a
+fluid), the card for SOFA contains G0. The whole stress relaxes, as in the simulations here (part = "all"). A shear
+test does not determine the bulk modulus. The bulk modulus is computed from Poisson's ratio `POISSON`.
 """
 
 from pathlib import Path
 
 import numpy as np
 
+from fitting.fits.families.limits import equilibrium_of
 from fitting.methods.generalised_maxwell import Maxwell
 from liverjax.core.files import write_whole
 
@@ -19,10 +20,13 @@ POISSON = 0.49
 FEBIO_TERMS = 6
 #: Largest sum of ratios in the cards for Abaqus and liverjax, where the sum must be below 1.
 LARGEST_SUM = 1 - 1e-6
+#: An equilibrium modulus below this many standard errors cannot be distinguished from zero.
+_DISTINCT = 2.0
 
 
-def write(folder: Path, model: Maxwell) -> list[str]:
-    """Write all cards into `folder`. Return notes on everything that a program cannot represent."""
+def write(folder: Path, model: Maxwell, equilibrium_error: float = 0.0) -> list[str]:
+    """Write all cards into `folder`. Return notes on everything that a program cannot represent. `equilibrium_error`:
+    standard error [Pa] of the equilibrium modulus."""
     folder.mkdir(parents=True, exist_ok=True)
     told = []
     if len(model.ratios) > FEBIO_TERMS:
@@ -41,10 +45,21 @@ def write(folder: Path, model: Maxwell) -> list[str]:
         ("liverjax.toml", scene_tables),
         ("abaqus.inp", abaqus),
         ("ansys.inp", ansys),
-        ("sofa.xml", sofa),
     ):
         write_whole(folder / name, card(model))
+    write_whole(folder / "sofa.xml", sofa(model, equilibrium_error))
+    if not _is_solid(model, equilibrium_error):
+        told.append(
+            f"the model is a fluid within the error of the fit (equilibrium modulus {equilibrium_of(model):.3g} Pa): "
+            f"the card for SOFA contains G0 = {float(model.shear_modulus):.4g} Pa, and its stress does not relax"
+        )
     return told
+
+
+def _is_solid(model: Maxwell, equilibrium_error: float) -> bool:
+    """Return whether the equilibrium modulus can be distinguished from zero. Its standard error is given in Pa."""
+    smallest = (1 - LARGEST_SUM) * float(model.shear_modulus)
+    return equilibrium_of(model) > max(smallest, _DISTINCT * equilibrium_error)
 
 
 def _span(model: Maxwell) -> str:
@@ -148,17 +163,18 @@ def ansys(model: Maxwell) -> str:
     return "\n".join([*lines, ""])
 
 
-def sofa(model: Maxwell) -> str:
-    """Return a hyperelastic force field for SOFA with the equilibrium modulus, or with G0 if the model is a fluid. SOFA
-    has no Prony series, so the series is in a comment.
+def sofa(model: Maxwell, equilibrium_error: float = 0.0) -> str:
+    """Return a hyperelastic force field for SOFA with the equilibrium modulus, or with G0 if the equilibrium modulus
+    cannot be distinguished from zero (a fluid). SOFA has no Prony series, so the series is in a comment.
+    `equilibrium_error`: standard error [Pa] of the equilibrium modulus.
 
     The energy of SOFA's law is mu/2 (I1 - 3) - mu ln J + lambda/2 (ln J)^2. So the second parameter is Lame's lambda,
     not the bulk modulus.
     """
     G0, ratios, times = model
-    rest = float(G0) * (1 - float(np.sum(ratios)))
-    shear = rest if rest > 1e-6 * float(G0) else float(G0)
-    what = "equilibrium" if shear == rest else "instantaneous (the model is a fluid)"
+    solid = _is_solid(model, equilibrium_error)
+    shear = equilibrium_of(model) if solid else float(G0)
+    what = "equilibrium" if solid else "instantaneous (the model is a fluid, within the error of the fit)"
     modes = "; ".join(f"{_written_number(g)} {_written_number(t)}" for g, t in zip(ratios, times, strict=True))
     return (
         f"<!-- SI units: Pa, s. The {what} shear modulus of these modes: SOFA has no Prony series.\n"

@@ -32,6 +32,7 @@ class Prediction(NamedTuple):
     sizes: np.ndarray  # (m,) relative error = |predicted - measured| / sizes; infinite if a value does not count
     inside: np.ndarray  # (m,) whether the point is in the band of the fitted sweep
     noise: np.ndarray  # (m,) noise of the measured values, divided by `scales`; NaN: too few values to estimate it
+    quantile: float  # half width of the 95 % interval of the fit, divided by its standard error
 
     @property
     def relative_errors(self) -> np.ndarray:
@@ -47,14 +48,14 @@ class Prediction(NamedTuple):
 
     @property
     def covered(self) -> float:
-        """Fraction of the measured values in the band that lie within the 95 % interval of the prediction. The width of
-        this interval includes the scatter of the measured values. NaN if this scatter is unknown."""
+        """Fraction of the measured values in the band that lie within the 95 % interval of the prediction. The half
+        width of this interval is the root of the sum of two squares: the half width from the fit (`quantile`), and the
+        half width from the scatter of the measured values. NaN if this scatter is unknown."""
         if np.isnan(self.noise).any():
             return np.nan
         off, own = (v[self.inside] for v in (self.predicted - self.measured, self.noise * self.scales))
-        return float(
-            np.mean(np.abs(off) < scipy.stats.norm.ppf(0.975) * np.hypot(self.standard_errors[self.inside], own))
-        )
+        of_fit = self.quantile * self.standard_errors[self.inside]
+        return float(np.mean(np.abs(off) < np.hypot(of_fit, scipy.stats.norm.ppf(0.975) * own)))
 
 
 def predict(fit: Fit, resolved: tuple[float, float], test: Measured) -> Prediction:
@@ -90,7 +91,8 @@ def predict(fit: Fit, resolved: tuple[float, float], test: Measured) -> Predicti
     off, parts = (predicted - measured) / scales, len(series_of(test))
     rows = zip(np.split(off, parts), np.split(inside, parts), strict=True)
     noise = np.repeat([_scatter_around(*row, test) for row in rows], len(off) // parts)
-    return Prediction(name_of(test), test.source, predicted, measured, errors, scales, sizes, inside, noise)
+    own = (errors, scales, sizes, inside, noise, fit.uncertainty.quantile)
+    return Prediction(name_of(test), test.source, predicted, measured, *own)
 
 
 def _scatter_around(off: np.ndarray, inside: np.ndarray, test: Measured) -> float:
