@@ -22,8 +22,7 @@ def main(arguments: list[str] | None = None, prog: str = "python -m fitting") ->
         prog = f"{prog} {name}"
     command = importlib.import_module(f"fitting.commands.{name}")  # only this command is loaded, to save time
     options = command.parser(prog).parse_args(with_joined_numbers(given))
-    resumable = "resume" in options and not getattr(options, "parameters", None)
-    code = exit_code(command.run, options, resumable)
+    code = exit_code(command.run, options)
     if arguments is None:
         end_if_stopped(code)
     return code

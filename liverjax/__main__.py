@@ -31,7 +31,7 @@ def main(arguments: list[str] | None = None, prog: str = "liverjax") -> int:
         code = fit.run(given[1:], f"{prog} fit")
     else:
         options = _parser(prog).parse_args(with_joined_numbers(given))
-        code = exit_code(options.run, options, resumable="resume" in options)
+        code = exit_code(options.run, options)
     if arguments is None:
         end_if_stopped(code)
     return code

@@ -1,11 +1,13 @@
 """The command lines: files, exit codes, and one-line messages for unusable input."""
 
 import argparse
+import errno
 import importlib
 import json
 import os
 import subprocess
 import sys
+import time
 import tomllib
 from pathlib import Path
 
@@ -271,17 +273,61 @@ def test_ctrl_c_is_one_word_and_exit_code_130(monkeypatch, capsys):
     assert capsys.readouterr().err == "stopped\n"
 
 
-def test_ctrl_c_names_resume_if_the_fit_can_be_continued(monkeypatch, capsys):
-    from fitting.commands import field
+_KEEPING = [
+    [main, ["field", "scene.toml", "u.csv", "--out", "out"], "out/progress.h5"],
+    [main, ["waves", "u.npz", "--out", "out"], "out/progress_of_regions.h5"],
+    [liverjax_main, ["simulate", "scene.toml", "--out", "out"], "out/result.h5.parts/part_000000.h5"],
+    [liverjax_main, ["sweep", "scene.toml", "rows.csv"], "rows.h5.parts/part_000000.h5"],
+]
 
-    def stopped(*_):
-        raise KeyboardInterrupt
 
-    monkeypatch.setattr(field, "run", stopped)
-    assert main(["field", "scene.toml", "u.csv"]) == 130
-    assert capsys.readouterr().err == "stopped; finished parts are kept: continue with --resume\n"
-    assert main(["field", "scene.toml", "u.csv", "--parameters", "law.mu"]) == 130
-    assert capsys.readouterr().err == "stopped\n"
+@pytest.mark.parametrize("number", [None, errno.ENOSPC, errno.EFBIG])
+@pytest.mark.parametrize("command, arguments, file", _KEEPING)
+def test_resume_is_named_if_there_is_a_file_to_continue_from(
+    command, arguments, file, number, tmp_path, monkeypatch, capsys
+):
+    """Ctrl-C named --resume also if nothing was kept. A full disk did not name it, and the repeated command was
+    refused."""
+
+    age = 0
+
+    def ended(options):
+        if not options.resume and options.out != Path("none"):
+            Path(file).parent.mkdir(parents=True, exist_ok=True)
+            Path(file).write_text("")
+            os.utime(file, 2 * (time.time() - age,))
+        raise KeyboardInterrupt if number is None else OSError(number, "")
+
+    module = f"{'fitting' if command is main else 'liverjax'}.commands.{arguments[0]}"
+    monkeypatch.setattr(importlib.import_module(module), "run", ended)
+    monkeypatch.chdir(tmp_path)
+    for more, age_of_file, named in (
+        (["--out", "none"], 0, False),
+        ([], 0, True),
+        ([], 100, False),
+        (["--resume"], 100, True),
+    ):
+        age = age_of_file
+        assert command([*arguments, *more]) == (2 if number else 130)
+        assert ("with --resume" in capsys.readouterr().err) == named
+
+
+@pytest.mark.parametrize("name", ["stdout", "stderr"])
+def test_a_closed_pipe_does_not_end_a_command(name, tmp_path, monkeypatch):
+    """The command ended at its next line of text with exit code 0, and its files were not written."""
+    reader, writer = os.pipe()
+    os.close(reader)
+
+    def run(_):
+        print("note", file=getattr(sys, name))
+        (tmp_path / "result.txt").write_text("written")
+        print("more", file=getattr(sys, name))
+        return 1
+
+    with os.fdopen(writer, "w", buffering=1) as pipe:
+        monkeypatch.setattr(sys, name, pipe)
+        assert exit_codes.exit_code(run, argparse.Namespace()) == 1
+    assert (tmp_path / "result.txt").read_text() == "written"
 
 
 def test_after_ctrl_c_a_command_does_not_wait_for_computations():

@@ -133,6 +133,25 @@ def test_displacements_in_another_unit_are_told(tmp_path, capsys):
     assert found["chi2_per_component"] > 1.5 and "check the unit (--unit)" in found["warnings"][0]
 
 
+def test_the_progress_of_an_earlier_map_does_not_stay(tmp_path, monkeypatch, capsys):
+    """After Ctrl-C, the file of another map was still there, and --resume refused it."""
+
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    _scene(tmp_path)
+    out = tmp_path / "out"
+    (tmp_path / "u.csv").write_text("node,ux,uy,uz\n5,1e-3,0,0\n6,1e-3,0,1e-4")
+    monkeypatch.setattr(scene_numbers, "with_discretisation_as_noise", stopped)
+    command = ["field", str(tmp_path / "scene.toml"), str(tmp_path / "u.csv"), "--noise", "5e-5", "--out", str(out)]
+    out.mkdir()
+    (out / "progress.h5").write_text("another map")
+    assert main([*command, "--resume"]) == 130
+    assert "stopped; finished parts are kept: continue with --resume\n" in capsys.readouterr().err
+    assert main(command) == 130
+    assert capsys.readouterr().err.endswith("\nstopped\n") and not (out / "progress.h5").exists()
+
+
 def test_scenes_of_two_orders_have_different_meshes(tmp_path):
     """The scenes have as many elements, but not as many nodes. NumPy ended with a traceback."""
     scenes = [_scene(tmp_path)]

@@ -49,6 +49,16 @@ def test_scene_files(tmp_path, capsys):
     assert "the last step of this run is" in capsys.readouterr().err
 
 
+def test_the_run_about_which_a_body_oscillates_is_not_replaced(tmp_path, monkeypatch, capsys):
+    """With the default --out, the waves replaced the static run, and the exit code was 0."""
+    (tmp_path / "scene.toml").write_text(FILE + "frequencies = [40.0]\n")
+    (tmp_path / "result.h5").write_text("static run")
+    monkeypatch.chdir(tmp_path)
+    assert main(["simulate", "scene.toml", "--about", "result.h5"]) == 2
+    assert "--about result.h5 would be replaced by the results: give another --out" in capsys.readouterr().err
+    assert (tmp_path / "result.h5").read_text() == "static run"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("seconds", "told"), [(0.1, True), (1e4, False)])
 def test_a_run_that_has_not_rested_is_told(tmp_path, capsys, seconds, told):

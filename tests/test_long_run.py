@@ -1,5 +1,6 @@
 """A killed run continues from its finished parts and ends with the same numbers."""
 
+import json
 import os
 import signal
 import subprocess
@@ -15,7 +16,7 @@ import pytest
 import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.core import program_cache
-from liverjax.jobs import long_run, output, resumable_parts
+from liverjax.jobs import long_run, output, resumable_parts, sweep
 from liverjax.scenes import scene_file
 from liverjax.simulation.run import Result
 from liverjax.solvers.problem import StepStatistics
@@ -239,6 +240,37 @@ def test_a_damaged_file_with_the_input_is_told(tmp_path, content):
     (tmp_path / "run.json").write_text(content)
     with pytest.raises(lj.InputError, match=r"run\.json is damaged, so the input of the parts is unknown"):
         resumable_parts.same({"scene": "first"}, tmp_path / "run.json")
+
+
+def test_parts_that_another_process_uses_stay(tmp_path):
+    """A second process that had begun with --resume lost the parts while it was reading them."""
+    folder = resumable_parts.beside(tmp_path / "result.h5")
+    long_run.remove_parts(tmp_path / "result.h5")  # there are none
+    resumable_parts.make_folder(folder)
+    with resumable_parts.locked(folder / "lock_0"):
+        long_run.remove_parts(tmp_path / "result.h5")
+        assert folder.exists()
+    long_run.remove_parts(tmp_path / "result.h5")
+    assert not folder.exists()
+
+
+def test_parts_that_a_killed_sweep_left_are_removed(tmp_path):
+    """A process was killed while it removed its parts. They stayed, and refused a sweep with a changed table."""
+    (tmp_path / "scene.toml").write_text(LONG)
+    (tmp_path / "rows.csv").write_text("law.mu\n700\n")
+    table, out = sweep.read_sweep(tmp_path / "scene.toml", tmp_path / "rows.csv"), tmp_path / "rows.h5"
+    with h5py.File(out, "w") as file:
+        file.attrs["sweep"] = json.dumps(table.identity)
+        file["status"], file["volume_ratios"] = np.zeros((1, 2), int), np.ones((1, 2))
+    folder = resumable_parts.beside(out)
+    for identity in ({"scene": "another"}, table.identity):
+        resumable_parts.make_folder(folder)
+        resumable_parts.same(identity, folder / "sweep.json")
+        resumable_parts.write(resumable_parts.part(folder, 1), {"x": np.zeros(1)})
+        assert sweep.run(table, out, resume=True).computed == 0
+        assert folder.exists() == (identity is not table.identity)
+        if folder.exists():
+            resumable_parts.remove(folder)
 
 
 def test_a_kill_while_parts_are_removed_leaves_no_parts_of_unknown_input(tmp_path, monkeypatch):

@@ -1,5 +1,7 @@
 """Dotted names of scene files, and files that are written completely or not at all."""
 
+import os
+
 import numpy as np
 import pytest
 
@@ -61,4 +63,15 @@ def test_a_write_that_fails_leaves_the_file_as_it_was(tmp_path):
     with pytest.raises(KeyboardInterrupt), whole(file) as new:
         new.write_text("half")
         raise KeyboardInterrupt
+    assert file.read_text() == "first" and list(tmp_path.iterdir()) == [file]
+
+
+def test_two_processes_write_one_file(tmp_path, monkeypatch):
+    """Both used one temporary name: the second process failed, and removed the file of the first one."""
+    file = tmp_path / "result.h5"
+    with whole(file) as first:
+        first.write_text("first")
+        monkeypatch.setattr(os, "getpid", lambda: 0)
+        with pytest.raises(OSError), whole(file):
+            raise OSError
     assert file.read_text() == "first" and list(tmp_path.iterdir()) == [file]

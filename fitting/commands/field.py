@@ -60,7 +60,9 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument(
         "--out", type=Path, default=Path("field"), metavar="DIR", help="folder of the results (default field)"
     )
-    command.set_defaults(optional_files=("field.vtu", "field.h5", "field.png"))
+    command.set_defaults(
+        optional_files=("field.vtu", "field.h5", "field.png"), kept=lambda options: options.out.glob("progress.h5")
+    )
     return command
 
 
@@ -129,6 +131,8 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     how = field.MapOptions(
         max_iterations=options.iterations or _ITERATIONS, file=file, resume=options.resume, progress=told
     )
+    if not options.resume:
+        file.unlink(missing_ok=True)  # this file is from an earlier run
     problem, beside = scene_numbers.with_discretisation_as_noise(problem)
     _tell_sizes(problem, beside)
     with bar, warnings.catch_warnings():

@@ -78,7 +78,9 @@ def parser(prog: str) -> argparse.ArgumentParser:
     )
     command.add_argument("--resume", action="store_true", help="continue from the last step written to --out")
     command.add_argument("--out", type=Path, default=Path("waves"), metavar="DIR", help="folder (default waves)")
-    command.set_defaults(optional_files=(*FILES[2:4], "sweep_*.csv"))
+    command.set_defaults(
+        optional_files=(*FILES[2:4], "sweep_*.csv"), kept=lambda options: options.out.glob("progress*.h5")
+    )
     return command
 
 

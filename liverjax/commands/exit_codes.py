@@ -1,6 +1,7 @@
 """Run a command and end it with an exit code. An error is reported in one sentence."""
 
 import argparse
+import contextlib
 import errno
 import io
 import os
@@ -9,12 +10,16 @@ import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import TextIO
 
 from liverjax.core import program_cache
 from liverjax.core.errors import InputError
 
-#: Error numbers of a full disk and of an exhausted disk quota. Not every system has quotas.
-FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)}
+#: Error numbers of a full disk, of a file above the maximum size and of an exhausted disk quota. Not every system has
+#: quotas.
+FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
+#: Exit code for unusable input or a full disk.
+UNUSABLE = 2
 #: Exit code after Ctrl-C, as in shells.
 STOPPED = 130
 
@@ -26,55 +31,88 @@ def show_unknown_letters() -> None:
         sys.stdout.reconfigure(errors="replace")
 
 
-def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namespace, resumable: bool = False) -> int:
+class _Unbroken:
+    """Standard output or standard error without `BrokenPipeError`: if the reader of a pipe has closed it, the text is
+    lost, and the command continues."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self.stream = stream
+
+    def write(self, text: str) -> int:
+        try:
+            return self.stream.write(text)
+        except BrokenPipeError:
+            self._discard()
+            return len(text)
+
+    def flush(self) -> None:
+        try:
+            self.stream.flush()
+        except BrokenPipeError:
+            self._discard()
+
+    def _discard(self) -> None:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), self.stream.fileno())
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self.stream, name)
+
+
+def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namespace) -> int:
     """Run a command and return its exit code. The exit code is 2 for unusable input or a full disk, and 130 for Ctrl-C.
 
-    Compiled programs are kept on disk for the next command (see `liverjax.core.program_cache`). If `options` has
-    `optional_files`, a note lists the optional files in the folder of results that come from an earlier run.
+    Compiled programs are kept on disk for the next command (see `liverjax.core.program_cache`). A command whose output
+    goes to a closed pipe continues to its end.
 
     Args:
         run: function that runs the command with its options and returns 0 or 1.
-        options: the parsed command line.
-        resumable: whether an interrupted run can be continued with --resume.
+        options: the parsed command line. If it has `optional_files`, a note lists the optional files in the folder of
+            results that come from an earlier run. If it has `resume`, then `kept` is a function of `options` that
+            returns the files from which an interrupted run can be continued.
     """
-    with warnings.catch_warnings():
+    out, err = _Unbroken(sys.stdout), _Unbroken(sys.stderr)
+    with warnings.catch_warnings(), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
         begin = time.time()
         try:
             with program_cache.kept_on_disk():
                 code = run(options)
             _tell_of_earlier_files(options, begin)
+            out.flush()
             return code
         except InputError as error:
             print(f"error: {error}", file=sys.stderr)
-            return 2
+            return UNUSABLE
         except KeyboardInterrupt:
-            print(
-                "stopped" + ("; finished parts are kept: continue with --resume" if resumable else ""), file=sys.stderr
-            )
+            kept = "; finished parts are kept: continue with --resume" if _any_kept(options, begin) else ""
+            print(f"stopped{kept}", file=sys.stderr)
             return STOPPED
-        except BrokenPipeError:  # the reader of a pipe has closed it
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return 0
         except OSError as error:
             if error.errno is None or error.errno not in FULL:
                 raise
+            resume = " with --resume" if _any_kept(options, begin) else ""
             print(
                 f"error: the last file is not complete ({os.strerror(error.errno)}). Free disk space, and repeat the "
-                "command",
+                f"command{resume}",
                 file=sys.stderr,
             )
-            return 2
+            return UNUSABLE
+        finally:
+            with contextlib.suppress(OSError):
+                out.flush()
 
 
 def end_if_stopped(code: int) -> None:
-    """End the process immediately if its exit code is `STOPPED` (Ctrl-C).
+    """End the process immediately if its exit code is `STOPPED` (Ctrl-C) or `UNUSABLE`.
 
-    JAX may still compute in another thread. Python would wait for that thread, and the process could end with a crash.
+    After Ctrl-C JAX may still compute in another thread. Python would wait for that thread, and the process could end
+    with a crash. After a full disk HDF5 would try to write its file again, and would crash.
     """
-    if code == STOPPED:
-        sys.stdout.flush()
-        sys.stderr.flush()
+    if code in (STOPPED, UNUSABLE):
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError):  # the disk of the output is full
+                stream.flush()
         os._exit(code)
 
 
@@ -86,6 +124,13 @@ def _tell_of_earlier_files(options: argparse.Namespace, begin: float) -> None:
     if names:
         verb = "is" if len(names) == 1 else "are"
         print(f"note: {', '.join(names)} in {options.out} {verb} from an earlier run", file=sys.stderr)
+
+
+def _any_kept(options: argparse.Namespace, begin: float) -> bool:
+    """Return whether --resume can continue the run: files to continue from were written since `begin`, or the run
+    itself continues from files."""
+    kept = options.kept(options) if "resume" in options else ()
+    return any(options.resume or not _older(file, begin) for file in kept)
 
 
 def _older(path: Path, begin: float) -> bool:

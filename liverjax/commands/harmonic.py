@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,8 +20,8 @@ def run(options: argparse.Namespace, scene: "Scene", text: str) -> int:
     from liverjax.core.versions import versions
     from liverjax.jobs import waves
 
-    _refuse_options(options)
     target = options.out / "result.h5"
+    _refuse_options(options, target)
     writable(options.out, (target.name,))
     ran = waves.solved_waves(scene, options.about, options.mesh_error)
     waves.write_waves(
@@ -39,11 +40,13 @@ def run(options: argparse.Namespace, scene: "Scene", text: str) -> int:
     return 0
 
 
-def _refuse_options(options: argparse.Namespace) -> None:
+def _refuse_options(options: argparse.Namespace, target: Path) -> None:
     given = {"fields": options.fields, "reactions": options.reactions, "png": options.png, "resume": options.resume}
     for name, value in (given | {"every": options.every is not None}).items():
         if value:
             raise InputError(f"--{name} cannot be used with [solve] kind = 'harmonic': remove this option")
+    if options.about is not None and options.about.resolve() == target.resolve():
+        raise InputError(f"--about {options.about} would be replaced by the results: give another --out")
 
 
 def _tell(scene: "Scene", ran: "Waves") -> None:

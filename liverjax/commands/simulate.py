@@ -42,7 +42,11 @@ def add(parsers: argparse._SubParsersAction) -> None:
         help="only for kind = 'harmonic': the body vibrates about the last state of this run",
     )
     add_out(command)
-    command.set_defaults(run=run, optional_files=("reactions.csv", "result.png", "vtu"))
+    command.set_defaults(
+        run=run,
+        optional_files=("reactions.csv", "result.png", "vtu"),
+        kept=lambda options: options.out.glob("result.h5.parts/*"),
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -52,7 +56,7 @@ def run(options: argparse.Namespace) -> int:
 
     from liverjax.core import status
     from liverjax.core.struct import replace
-    from liverjax.jobs import fields, long_run, output, resumable_parts
+    from liverjax.jobs import fields, long_run, output
     from liverjax.scenes import scene_file
     from liverjax.simulation.cautions import cautions_of_run
     from liverjax.simulation.run import unloaded
@@ -87,8 +91,8 @@ def run(options: argparse.Namespace) -> int:
     found = fields.fields(scene, ran.result, names) if names else {}
     said = [*cautions_of_run(replace(scene, points_are=given), ran.result), *unknown]
     _write_and_tell((scene, text, said), ran, target, found)
-    if in_parts and resumable_parts.beside(target).exists():
-        resumable_parts.remove(resumable_parts.beside(target))
+    if in_parts:
+        long_run.remove_parts(target)
     written = [str(target)]
     if reactions:
         output.write_reactions(options.out / "reactions.csv", scene, ran.result)

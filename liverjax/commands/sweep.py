@@ -44,7 +44,7 @@ def add(parsers: argparse._SubParsersAction) -> None:
         "cluster (SLURM)"
     )
     command.add_argument("--distributed", nargs="*", metavar="HOST:PORT N I", help=where)
-    command.set_defaults(run=run)
+    command.set_defaults(run=run, kept=lambda options: Path(f"{_results(options)}.parts").glob("*"))
 
 
 def run(options: argparse.Namespace) -> int:
@@ -70,7 +70,7 @@ def run(options: argparse.Namespace) -> int:
         raise InputError(
             f"{options.scene}: [solve] {own} cannot be used in a sweep; use python -m liverjax simulate for each row"
         )
-    out = options.out or options.parameters.with_suffix(".h5")
+    out = _results(options)
     if out.is_dir():
         raise InputError(f"--out {out} is a folder: name a file for the results, e.g. {out / 'sweep.h5'}")
     bar = tqdm(total=len(table.rows), unit="row", disable=None, leave=False)  # shown only on a terminal
@@ -99,6 +99,10 @@ def run(options: argparse.Namespace) -> int:
     if done.failed:
         print(f"to run these rows again, use --rows {' '.join(map(str, done.failed))} --out OTHER.h5", file=sys.stderr)
     return 1 if done.failed else 0
+
+
+def _results(options: argparse.Namespace) -> Path:
+    return options.out or options.parameters.with_suffix(".h5")
 
 
 def _of_crushed(rows: dict[int, float]) -> list[str]:

@@ -91,7 +91,7 @@ def _made(file: Path, function: Callable[..., Any], arguments: tuple, options: d
 
         example = jax.tree.unflatten(shape[0], range(shape[0].num_leaves))
         content = zlib.compress(pickle.dumps((*serialize_executable.serialize(program), example)), 1)
-        with whole(file, f".{os.getpid()}.part") as beside:
+        with whole(file) as beside:
             beside.write_bytes(content)
     except Exception:  # e.g. callbacks in the program, or a full disk: the program runs, but is not stored
         pass

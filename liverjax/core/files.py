@@ -4,6 +4,7 @@ A progress file contains marks (digests) of its problem, so that a run continues
 """
 
 import hashlib
+import os
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -34,16 +35,13 @@ def writable(out: Path, files: tuple[str, ...]) -> None:
 
 
 @contextmanager
-def whole(file: Path, ending: str = ".part") -> Iterator[Path]:
+def whole(file: Path) -> Iterator[Path]:
     """Yield a temporary path next to `file`. At the end of the context, the temporary file is renamed to `file`.
 
     If the process is killed or an error occurs, `file` does not change. After an error the temporary file is removed.
-
-    Args:
-        file: the file that is written completely or not at all.
-        ending: suffix of the temporary path. If several processes may write `file`, each needs a different suffix.
+    The temporary name contains the number of the process, so that several processes can write `file`.
     """
-    beside = file.with_suffix(ending)
+    beside = file.with_suffix(f".{os.getpid()}.part")
     try:
         yield beside
         beside.replace(file)

@@ -8,6 +8,7 @@ a resumed run gives exactly the same numbers.
 import time
 import tomllib
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -59,6 +60,14 @@ def refuse_unfinished(out: Path, resume: bool, text: str | None = None) -> None:
             raise InputError(f"{out} is the result of another scene: give another --out, or remove --resume")
 
 
+def remove_parts(out: Path) -> None:
+    """Remove the parts of the finished run `out`, if there are parts. If another process uses them, they stay, and that
+    process removes them at its end."""
+    folder = resumable_parts.beside(out)
+    with suppress(InputError, FileNotFoundError), resumable_parts.locked(folder / "lock_0"):
+        resumable_parts.remove(folder)
+
+
 def run(
     scene: Scene,
     text: str,
@@ -72,7 +81,7 @@ def run(
     Args:
         scene: `Scene`.
         text: content of the scene file; results of another scene file are not continued.
-        out: file of the results. The caller writes it, and then removes `resumable_parts.beside(out)`.
+        out: file of the results. The caller writes it, and then calls `remove_parts`.
         every: number of steps per part.
         resume: whether to continue from the parts on disk.
         report: function that is called with the number of every finished step, including steps from disk. It is called

@@ -38,7 +38,7 @@ def write(file: Path, content: dict[str, np.ndarray]) -> None:
     with h5py.File(memory, "w") as datasets:
         for name, value in content.items():
             datasets[name] = value
-    with whole(file, f".{os.getpid()}") as new, new.open("wb") as out:
+    with whole(file) as new, new.open("wb") as out:
         out.write(memory.getbuffer())
         out.flush()
         os.fsync(out.fileno())
@@ -102,7 +102,7 @@ def same(identity: Mapping[str, object], file: Path) -> None:
                 f"{file.parent} contains parts, but not the file {file.name} with their input: give another --out, or "
                 "remove this folder"
             )
-        with whole(file, f".{os.getpid()}") as new:
+        with whole(file) as new:
             new.write_text(json.dumps(identity))
         return
     try:

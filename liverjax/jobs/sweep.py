@@ -12,6 +12,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
 from typing import NamedTuple
@@ -222,7 +223,9 @@ def run(
     """
     folder = resumable_parts.beside(out)
     if out.exists():
-        return _already(sweep, out, resume)
+        done = _already(sweep, out, resume)
+        _remove_left(sweep, folder)
+        return done
     if folder.exists() and not resume and process[1] == 1:
         raise InputError(f"{folder} contains an unfinished sweep: continue with --resume, or remove this folder")
     resumable_parts.make_folder(folder)
@@ -295,6 +298,13 @@ def _already(sweep: Sweep, out: Path, resume: bool) -> Done:
     except (OSError, KeyError, ValueError, TypeError):
         raise InputError(f"{out} is not the result of a sweep: give another --out, or remove this file") from None
     return Done(out, _failures(sweep, codes), 0, _crushed(sweep, codes, J))
+
+
+def _remove_left(sweep: Sweep, folder: Path) -> None:
+    """Remove the parts of a finished sweep. They are there if a process was killed before it had removed them."""
+    with suppress(InputError, OSError), resumable_parts.locked(folder / "lock_join"):
+        resumable_parts.same(sweep.identity, folder / "sweep.json")
+        resumable_parts.remove(folder)
 
 
 def _joined(sweep: Sweep, out: Path, folder: Path, computed: int) -> Done:
