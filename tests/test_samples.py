@@ -196,6 +196,70 @@ def test_a_typical_sample_has_the_mean_equilibrium_modulus():
     assert len(left) == 1 and left[0] == pytest.approx(found.populations["ratios[0]"].mean)
 
 
+def fluids(scales, weights):
+    """Return sweeps of fluids with two modes and 1 % of noise. `weights`: ratio of the slow mode of each sample."""
+    omega, rng, sweeps = np.geomspace(0.1, 100, 16), np.random.default_rng(0), []
+    for scale, weight in zip(scales, weights, strict=True):
+        modes = Maxwell(np.float64(1200.0 * scale), np.array([weight, 1 - weight]), np.array([3.0, 0.1]))
+        storage, loss = np.array(generalised_maxwell.moduli(modes, omega)) * (1 + 0.01 * rng.standard_normal((2, 16)))
+        sweeps.append(Sweep(omega, storage, loss, source=f"f{len(sweeps)}.csv"))
+    return sweeps
+
+
+def test_a_typical_sample_of_fluids_is_a_fluid():
+    """The means of the ratios left an equilibrium modulus of 108 Pa, without a message."""
+    found = samples.fit(fluids((1, 1, 1), (0.25, 0.5, 0.75)), "prony", 2)
+    assert all(found.values(k)["equilibrium_modulus"][0] < 1 for k in range(3))
+    assert float(found.typical.equilibrium_modulus) < 1e-5 and np.isclose(found.typical.ratios[0], 0.5, rtol=0.03)
+    said = samples_report.warnings(found)
+    assert any(w.startswith("equilibrium_modulus: fewer than two") and w.endswith("is a fluid") for w in said)
+
+
+def test_a_spectrum_of_another_stiffness_is_named():
+    """No parameter was compared, because a spectrum of a fluid has only strengths."""
+    found = samples.fit(fluids((5, 1, 1.1, 0.9, 1.05, 0.95), [0.4] * 6), "spectrum")
+    assert all(name.startswith("strengths[") for name in found.populations)
+    (said,) = outliers(found)
+    assert said.startswith("f0.csv: its |G*| at 0.503 Hz is 5 times the mean") and "Check the units and sizes" in said
+    two = found._replace(sweeps=found.sweeps[:2], fits=found.fits[:2])
+    assert outliers(two) == []
+    far = samples.fit(fluids((200, 1), (0.4, 0.4)), "spectrum")
+    (said,) = outliers(far)
+    assert "the |G*| at 0.503 Hz is at least a factor of" in said
+
+
+def test_additive_errors_do_not_raise_the_mean():
+    """60 draws of 10 values with the mean 100, a spread of 0.4 and equal errors of 40. The median of the means was
+    132, and 70 % of the intervals contained the mean. The values 0 were ignored.
+    """
+    rng, means, inside = np.random.default_rng(0), [], []
+    for _ in range(60):
+        values = np.maximum(100 * np.exp(0.4 * rng.standard_normal(10)) + 40 * rng.standard_normal(10), 0)
+        p = population(values, np.where(values > 0, 40.0, np.inf), additive=True)
+        means.append(p.mean)
+        inside.append(p.mean_interval[0] < 100 < p.mean_interval[1])
+        assert np.all(p.pooled > 0)
+    assert np.median(means) < 115 and np.mean(inside) > 0.85
+
+
+def test_small_additive_errors_change_nothing():
+    """Fluids among precise solids are no samples of their population. A fluid of 2 +- 1 Pa gave an interval of 9 Pa to
+    4.6 kPa for the mean.
+    """
+    values, errors = np.array([500.0, 700.0, 600.0, 650.0, 0.0, 2.0]), np.array([5.0, 5.0, 5.0, 5.0, np.inf, 1.0])
+    p, q = population(values, errors, additive=True), population(values[:4], errors[:4])
+    assert np.isclose(p.mean, q.mean, rtol=1e-3) and np.isclose(p.spread, q.spread, rtol=1e-2)
+    assert np.all(np.isnan(p.pooled[4:])) and np.allclose(p.pooled[:4], q.pooled, rtol=1e-3)
+
+
+def test_the_figure_does_not_show_a_fluid_at_zero():
+    """The axis of the values began at 3e-5 of the mean."""
+    omega = np.geomspace(0.1, 100, 16)
+    found = samples.fit([solid(G, omega, k) for k, G in enumerate((300.0, 310.0, 290.0, 0.0))], "prony", 3)
+    low, high = samples_report.figure(found).axes[1].get_xlim()
+    assert 0.1 < low < 1 < high < 10
+
+
 def test_an_exponent_of_a_new_sample_is_at_most_one(monkeypatch):
     """The interval of a new sample reached 1.9."""
     monkeypatch.setattr(samples, "values_of_sample", lambda fit: fit)
@@ -268,7 +332,7 @@ def write_samples(folder, count=5, spread=0.3, noise=0.01):
 def test_the_command_fits_each_sample_and_the_population(tmp_path, capsys):
     files, truths = write_samples(tmp_path)
     out = tmp_path / "fit"
-    assert main([*files, "--modes", "1", "--out", str(out)]) == 0
+    assert main([*files, "--modes", "1", "--height", "0.002", "--out", str(out)]) == 0
     content, table = json.loads((out / "fit.json").read_text()), capsys.readouterr().out
     assert content["model"] == "prony" and content["modes"] == 1 and len(content["samples"]) == 5
     for sample, file, truth in zip(content["samples"], files, truths, strict=True):
@@ -277,6 +341,8 @@ def test_the_command_fits_each_sample_and_the_population(tmp_path, capsys):
         e = sample["standard_errors"]
         errors = [e["shear_modulus"], e["ratios"][0], e["relaxation_times"][0]]
         assert np.all(np.abs(np.array(found) - truth) < 4 * np.array(errors))
+        share = np.hypot(50e-6 / 0.002, 4 * 10e-6 / 0.01) * found[0]  # usual errors of gap and radius
+        assert sample["total_errors"]["shear_modulus"] >= np.hypot(share, errors[0]) * (1 - 1e-6)
     p = content["population"]["shear_modulus"]
     logs = np.log(truths[:, 0])  # the true values of these five, known to 1 %
     assert np.isclose(np.log(p["mean"]), logs.mean(), atol=0.02)

@@ -17,6 +17,8 @@ def run(options: argparse.Namespace) -> int:
     import numpy as np
 
     from fitting.fits import samples
+    from fitting.fits.honesty import total_error
+    from fitting.fits.simulated_rheometer import Simulation
     from fitting.reports import samples_report
     from liverjax.core.files import writable
 
@@ -34,6 +36,10 @@ def run(options: argparse.Namespace) -> int:
     for path, sweep, corrected in zip(options.sweep, sweeps, found.sweeps, strict=True):
         for note in corrected.notes[len(sweep.notes) :]:
             print(f"note: {path.name}: {note}", file=sys.stderr)
+    usual = Simulation()
+    rig = Simulation(radius=options.radius or usual.radius, height=options.height or usual.height)
+    for fit in found.fits:
+        fit.details["geometry_error"] = total_error.of_geometry(rig, None)
     content = samples_report.write(options.out, found)
     print(samples_report.table(found))
     if options.cards:

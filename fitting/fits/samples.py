@@ -153,7 +153,8 @@ def _populations(fits: list[Fit]) -> dict[str, Population | None]:
     # The spectrum of the first sample may have no equilibrium modulus.
     for name in (*dict.fromkeys(n for row in known for n in row if "[" not in n), *names):
         pairs = np.array([row.get(name, (0.0, np.inf)) for row in known])
-        found = population(pairs[:, 0], pairs[:, 1])
+        # The equilibrium modulus is the small rest of larger moduli, so its error hardly depends on its value.
+        found = population(pairs[:, 0], pairs[:, 1], additive=name == "equilibrium_modulus")
         if found is not None and (name.startswith("ratios[") or "exponent" in name):  # these cannot exceed 1
             of_mean, of_new = ((low, min(1.0, high)) for low, high in (found.mean_interval, found.new_interval))
             found = found._replace(mean_interval=of_mean, new_interval=of_new)
@@ -177,11 +178,16 @@ def outliers(found: Samples) -> list[str]:
     radius multiplies all moduli by one factor. The other half is used for all other parameters together.
 
     The strengths of a spectrum are not compared, because one strength may grow while its neighbour on the grid falls.
+    Instead, the first parameter is then |G*| in the middle of the common band.
     """
     names = [n for n in found.populations if not n.startswith("strengths[")]
+    compared = {n: np.array([found.values(k)[n] for k in range(len(found.fits))]) for n in names}
+    if len(names) < len(found.populations):
+        compared = _middle_moduli(found) | compared
+        names = list(compared)
     told: dict[int, list[tuple[float, str, float, float]]] = {}
     for name in names:
-        for sample, chance, ratio, mean in _strangers(found, name):
+        for sample, chance, ratio, mean in _strangers(compared[name]):
             chance *= 1 if len(names) == 1 else 2 if name == names[0] else 2 * (len(names) - 1)
             if chance < _STRANGE:
                 told.setdefault(sample, []).append((chance, name, ratio, mean))
@@ -193,31 +199,44 @@ def outliers(found: Samples) -> list[str]:
             for chance, name, ratio, mean in own
         )
         what = "the units and sizes of this sample"
-        if not any(name.endswith(("modulus", "springpot")) for _, name, _, _ in own):  # no parameter is a modulus
+        moduli = ("modulus", "springpot", "Hz")  # ends of the names of moduli; "Hz" belongs to `_middle_moduli`
+        if not any(name.endswith(moduli) for _, name, _, _ in own):
             what = "the temperature, the unit of the frequency, and the sample"
         source = Path(found.sweeps[sample].source).name
         out.append(f"{source}: {which}. Check {what}. This sample widens the population's intervals")
-    if out:
+    if out or not names:
         return out
-    name = next((n for n in ("shear_modulus", *found.populations) if n in found.populations), "")
-    known, logs, _ = _known_logarithms(found, name)
+    name = "shear_modulus" if "shear_modulus" in names else names[0]
+    known, logs, _ = _known_logarithms(compared[name])
     return _of_another_unit(logs, [Path(found.sweeps[k].source).name for k in known], name)
 
 
-def _known_logarithms(found: Samples, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the indices of the samples that determine the parameter `name`, the logarithms of the values of this
-    parameter, and the standard errors of these logarithms."""
-    pairs = np.array([found.values(k)[name] for k in range(len(found.fits))])
+def _middle_moduli(found: Samples) -> dict[str, np.ndarray]:
+    """Return the fitted |G*| of the n samples in the middle of their common band, by name: (n, 2) with the values and
+    with the errors of single points. The result is empty if the samples have no common band."""
+    low, high = (np.log([s.angular_frequency[end] for s in found.sweeps]) for end in (0, -1))
+    if low.max() > high.min():
+        return {}
+    at, rows = (low.max() + high.min()) / 2, []
+    for fit, sweep in zip(found.fits, found.sweeps, strict=True):
+        size = np.exp(np.interp(at, np.log(sweep.angular_frequency), np.log(np.hypot(fit.storage, fit.loss))))
+        rows.append((size, size * fit.relative_errors(sweep).mean()))
+    return {f"|G*| at {np.exp(at) / (2 * np.pi):.3g} Hz": np.array(rows)}
+
+
+def _known_logarithms(pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the indices of the samples that determine a parameter, the logarithms of the values of this parameter, and
+    the standard errors of these logarithms. `pairs` (n, 2): values and standard errors."""
     known = np.flatnonzero((pairs[:, 0] > 0) & (pairs[:, 1] < _UNSURE * pairs[:, 0]))
     return known, np.log(pairs[known, 0]), pairs[known, 1] / pairs[known, 0]
 
 
-def _strangers(found: Samples, name: str) -> list[tuple[int, float, float, float]]:
-    """Return the samples whose parameter `name` is far from that of the other samples. Each entry contains the index of
+def _strangers(pairs: np.ndarray) -> list[tuple[int, float, float, float]]:
+    """Return the samples with a parameter that is far from that of the other samples. Each entry contains the index of
     the sample, the probability of such a distance by chance in any of the samples, the ratio of the parameter to the
-    mean of the others, and this mean.
+    mean of the others, and this mean. `pairs` (n, 2): values and standard errors of the parameter.
     """
-    known, logs, errors = _known_logarithms(found, name)
+    known, logs, errors = _known_logarithms(pairs)
     out = []
     for k, sample in enumerate(known if len(known) >= _FEWEST else ()):
         others = np.delete(logs, k)
@@ -253,9 +272,9 @@ def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str,
     """Return the Prony modes of a typical sample, whose parameters are the means of the populations. Modes without a
     mean are not included. For other parameters without a mean, the median of the samples is used.
 
-    The equilibrium modulus of Prony modes is also the mean of the population (0 if all samples are fluids): the mean
-    ratios are multiplied by one factor, because their sum alone would give another equilibrium modulus. This is
-    not done if a mode has no mean."""
+    The equilibrium modulus of Prony modes is also the mean of the population (0 if fewer than two samples determine
+    it): the mean ratios are multiplied by one factor, because their sum alone would give another equilibrium modulus.
+    This is not done if a mode has no mean."""
     kind, every = fits[0].kind, [values_of_sample(f) for f in fits]
     middle = {n: float(np.median([row.get(n, (0.0,))[0] for row in every])) for n in populations}
     mean = {name: p.mean for name, p in populations.items() if p is not None}
@@ -266,8 +285,7 @@ def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str,
         ratios, times = (np.array([mean[f"{n}[{k}]"] for k in known]) for n in ("ratios", "relaxation_times"))
         rest = mean.get("equilibrium_modulus", 0.0) / mean["shear_modulus"]
         factor = (1 - max(rest, 1e-9)) / max(ratios.sum(), 1e-300)
-        decided = rest < 1 and ("equilibrium_modulus" in mean or kind.name == viscoelastic.FLUID.name)
-        ratios = ratios * (factor if decided and len(known) == fits[0].modes else min(1.0, factor))
+        ratios = ratios * (factor if rest < 1 and len(known) == fits[0].modes else min(1.0, factor))
         return Maxwell(mean["shear_modulus"], ratios, times)  # type: ignore[arg-type]
     low, high = min(s.angular_frequency[0] for s in sweeps), max(s.angular_frequency[-1] for s in sweeps)
     if kind.effective is not None:

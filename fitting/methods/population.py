@@ -32,6 +32,12 @@ UNSURE = 0.25
 #: If the data of a sample do not determine its value, and this value is below this fraction of the mean, the sample is
 #: not part of the population.
 BELOW = 1e-3
+#: A value with an additive error is near 0 if it is below three times its error, and below this fraction of the median.
+NEAR_ZERO = 0.1
+#: A value near 0 is part of the population only if its error, divided by the median, exceeds this value.
+MAY_BE_ZERO = 0.2
+#: Largest number of rounds in which the moved values and the population are computed in turn.
+ROUNDS_OF_MOVING = 50
 
 
 class Population(NamedTuple):
@@ -41,13 +47,14 @@ class Population(NamedTuple):
     spread: float  # standard deviation of the logarithms between samples
     mean_interval: tuple[float, float]
     new_interval: tuple[float, float]  # interval of a new sample
-    pooled: np.ndarray  # (n,) values of the samples, moved towards the mean; NaN: see `BELOW`
+    pooled: np.ndarray  # (n,) values of the samples, moved towards the mean; NaN: see `BELOW`, `NEAR_ZERO`
     pooled_errors: np.ndarray  # (n,) standard deviations of the logarithms of `pooled`
 
 
-def population(values: np.ndarray, errors: np.ndarray) -> Population | None:
+def population(values: np.ndarray, errors: np.ndarray, additive: bool = False) -> Population | None:
     """Estimate mean and spread of the population from positive values (n,) with standard errors (n,). Returns None if
-    fewer than two values are determined."""
+    fewer than two values are determined. `additive`: the errors do not grow with the values, and a
+    value may be 0 (`_as_logarithms`)."""
     values, errors = np.asarray(values, float), np.asarray(errors, float)
     if values.ndim != 1 or values.shape != errors.shape or np.any(errors < 0):
         raise InputError(
@@ -57,7 +64,16 @@ def population(values: np.ndarray, errors: np.ndarray) -> Population | None:
     known = (values > 0) & np.isfinite(values) & np.isfinite(errors) & (errors < 10 * values)
     if known.sum() < 2:
         return None
-    y, v = np.log(values[known]), np.maximum((errors / values)[known] ** 2, 1e-24)
+    unsure = ~known
+    if additive:
+        unsure &= ~np.isfinite(errors)
+        errors = _with_errors_of_zeros(values, errors, known)
+        known = (values >= 0) & np.isfinite(values) & np.isfinite(errors)
+        if known.sum() < 2:
+            return None
+        y, v = _as_logarithms(values[known], errors[known])
+    else:
+        y, v = np.log(values[known]), np.maximum((errors / values)[known] ** 2, 1e-24)
     variance = _variance_between(y, v)
     mean, sd = _weighted_mean(y, v, variance)
     n = len(y)
@@ -73,7 +89,7 @@ def population(values: np.ndarray, errors: np.ndarray) -> Population | None:
     pooled, pooled_errors = np.full((2, len(values)), np.nan)
     # A sample whose data do not determine its value is treated like a new sample. But if this value is far below the
     # mean, the sample is of another material and is excluded.
-    silent = ~known & (values > BELOW * np.exp(mean))
+    silent = unsure & ~known & (values > BELOW * np.exp(mean))
     pooled[silent], pooled_errors[silent] = over.moved(np.zeros(silent.sum()), np.full(silent.sum(), 1e12))
     pooled[known], pooled_errors[known] = over.moved(y, v)
     mean_interval, new_interval = ((float(np.exp(a)), float(np.exp(b))) for a, b in intervals)
@@ -85,6 +101,39 @@ def population(values: np.ndarray, errors: np.ndarray) -> Population | None:
         pooled=np.exp(pooled),
         pooled_errors=pooled_errors,
     )
+
+
+def _with_errors_of_zeros(values: np.ndarray, errors: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return the errors (n,) of values with additive errors. The error is infinite if a value is not used.
+
+    A value of 0 has no error of its own. So it gets the median error of the values that are `known`. A value near 0 is
+    used only if its error is so large that a sample of this population may have this value. Otherwise, the sample is of
+    another material."""
+    clear = known & (values > 2 * errors)
+    typical = np.median(values[clear if clear.any() else known])
+    of_zero = np.where(values <= BELOW * typical, np.median(errors[known]), np.inf)
+    own = np.where(np.isfinite(errors), errors, of_zero)
+    away = known & (values > np.minimum(3 * errors, NEAR_ZERO * typical))
+    return np.where(away | (own > MAY_BE_ZERO * typical), own, np.inf)
+
+
+def _as_logarithms(values: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return logarithms (n,) and their error variances (n,) for values with errors that do not grow with the values.
+
+    The error of log(x) is e / x. With the measured x, a value that is too high by chance would get too much weight. So
+    the logarithm is linearised at the moved value m of the sample: log(m) + (x - m) / m has the error e / m. This also
+    holds for x = 0. The moved values follow from the population, so both are computed in turn."""
+    at = np.log(np.maximum(values, np.median(values[values > 0])))
+    for _ in range(ROUNDS_OF_MOVING):
+        m = np.exp(at)
+        y, v = at + (values - m) / m, np.maximum((errors / m) ** 2, 1e-24)
+        variance = _variance_between(y, v)
+        mean, _ = _weighted_mean(y, v, variance)
+        step = mean + variance / (variance + v) * (y - mean) - at
+        if np.max(np.abs(step)) < 1e-6:
+            break
+        at = at + step / 2  # whole steps may alternate between two populations
+    return y, v
 
 
 def _hull(a: tuple[float, float], b: tuple[float, float]) -> tuple[float, float]:

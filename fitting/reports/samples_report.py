@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fitting.fits.families import limits
-from fitting.fits.honesty import edges
+from fitting.fits.honesty import edges, total_error
 from fitting.fits.samples import Samples, outliers
 from fitting.fits.viscoelastic import SHORT
+from fitting.methods.population import BELOW
 from fitting.readers.rheometer import WARMER
 from fitting.readers.units import celsius
-from fitting.reports.sweep_report import band_sensitivity, numbers, summary
+from fitting.reports.sweep_report import band_sensitivity, by_stem, numbers, summary
 from liverjax.core.files import whole, write_whole
 from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save
 from liverjax.core.struct import Content
@@ -107,7 +108,8 @@ def _sample_entry(found: Samples, k: int) -> Content:
         for name, p in _known_errors(found).items()
     }
     more = {"data": sweep.source, "notes": list(sweep.notes), "pooled": pooled}
-    return summary(fit, sweep) | {"band_sensitivity": band_sensitivity(fit)} | more
+    whole = by_stem(total_error.total_errors(fit))
+    return summary(fit, sweep) | {"band_sensitivity": band_sensitivity(fit), "total_errors": whole} | more
 
 
 #: Words in the warnings of single samples, and the sentence of the summary that counts these warnings.
@@ -124,11 +126,15 @@ COUNTED = (
     ("use fewer modes", "a mode is not needed or not determined"),
 )
 
+#: A typical sample is called a fluid if its equilibrium modulus, divided by G0, is below this value.
+FLUID_BELOW = 1e-6
+
 
 def warnings(found: Samples) -> list[str]:
     """Return warnings about the population. For each kind of warning about single samples, also return a sentence that
     counts the samples with this warning."""
-    out = []
+    out, of_modes = [], found.kind.values is None
+    fluid = of_modes and np.sum(found.typical.ratios) > 1 - FLUID_BELOW
     for name, p in found.populations.items():
         own = np.array([found.values(k)[name][0] for k in range(len(found.fits))])
         if name.startswith("strengths["):
@@ -138,7 +144,10 @@ def warnings(found: Samples) -> list[str]:
                 f"{name}: the value is {np.round(own[0]):g} in all samples, so the springpot is a spring or dashpot"
             )
         elif p is None:
-            out.append(f"{name}: fewer than two samples determine this parameter, so its mean and spread are unknown")
+            typical = ", and the typical sample is a fluid" if name == "equilibrium_modulus" and fluid else ""
+            out.append(
+                f"{name}: fewer than two samples determine this parameter, so its mean and spread are unknown{typical}"
+            )
         else:
             if p.spread == 0:
                 out.append(
@@ -165,7 +174,7 @@ def warnings(found: Samples) -> list[str]:
     if failed:
         out.append(
             f"the fit of {', '.join(failed)} did not converge, and the parameters with the smallest "
-            f"misfit so far are given: try {'fewer modes' if found.kind.values is None else 'another --model'}"
+            f"misfit so far are given: try {'fewer modes' if of_modes else 'another --model'}"
         )
     for words, told in COUNTED:
         count = sum(any(words in w for w in f.warnings) for f in found.fits)
@@ -252,7 +261,7 @@ def figure(found: Samples) -> "Figure":
     known, labels = _known_errors(found), _labels(found)
     for row, (name, p) in enumerate(known.items()):
         own = np.array([found.values(k)[name][0] for k in range(len(found.fits))]) / p.mean
-        own = own[own > 0]
+        own = own[np.isfinite(p.pooled) & (own > BELOW)]
         right.plot(own, np.full(len(own), row), "|", color=GREY, ms=9)
         right.plot(np.array(p.new_interval) / p.mean, [row - 0.2] * 2, "-", color=ORANGE, lw=1.2)
         right.plot(np.array(p.mean_interval) / p.mean, [row + 0.2] * 2, "-", color=BLUE, lw=2.5)
