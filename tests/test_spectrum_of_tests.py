@@ -56,20 +56,24 @@ def test_a_material_that_still_relaxes_at_the_end_is_told(kind):
     """A springpot has no equilibrium modulus. The spectrum had one with a small error, and no warning."""
     test = in_time(kind, "springpot", 0.005)
     found = spectrum_of_tests.spectrum_in_time(test, NEAR)
-    (told,) = (w for w in found.warnings if "G' falls by" in w)
+    (told,) = (w for w in found.warnings if "G' of the model falls by" in w)
     assert found.kind.names[0] == "equilibrium_modulus" and told.endswith(": measure longer")
     solid = 500 + 300 * np.exp(-TIMES / 3)
     answer = np.append(np.nan, solid * (1 + 0.005 * np.random.default_rng(0).standard_normal(len(TIMES))))
     relaxed = spectrum_of_tests.spectrum_in_time(test._replace(kind="relaxation", answer=answer), NEAR)
-    assert not any("G' falls by" in w for w in relaxed.warnings)
+    assert not any("G' of the model falls by" in w for w in relaxed.warnings)
 
 
-def test_a_common_spectrum_tells_that_the_material_still_relaxes():
-    omega = np.geomspace(0.01, 300, 25)
+@pytest.mark.parametrize("given", [False, True])
+def test_a_common_spectrum_tells_that_the_material_still_relaxes(given):
+    """If the sweep had standard deviations and the lowest frequency, the noise of one standard deviation was taken for
+    a noise of 100 %, and the warning was lost."""
+    omega = np.geomspace(0.001 if given else 0.01, 300, 25)
     noise = 1 + 0.01 * np.random.default_rng(1).standard_normal((2, len(omega)))
     G = FORMULAS["springpot"](1j * omega, *TRUTHS["springpot"])
-    tests = [Sweep(omega, G.real * noise[0], G.imag * noise[1]), in_time("relaxation", "springpot")]
-    found = spectrum_of_tests.spectrum_together(tests, NEAR, np.array([0.01, 0.003]))
+    deviations = (0.01 * G.real, 0.01 * G.imag) if given else (None, None)
+    tests = [Sweep(omega, G.real * noise[0], G.imag * noise[1], *deviations), in_time("relaxation", "springpot")]
+    found = spectrum_of_tests.spectrum_together(tests, NEAR, np.array([1.0 if given else 0.01, 0.003]))
     assert any(w.endswith(": measure longer, or at lower frequencies") for w in found.warnings)
 
 

@@ -257,6 +257,13 @@ def test_a_fluid_is_no_solid_by_chance():
     assert min(rows.values()) == 0 and set(rows) > {"spectrum", "springpot"}
 
 
+def test_a_fluid_is_told_that_a_solid_fits_better():
+    """The criterion of the solid is 5.7 lower, which is not enough to choose it. There was no warning."""
+    fit = springpots_in_time.choose_in_time(creep_of_burgers(0.03), "prony", 2)
+    assert fit.kind.name == "prony_fluid"
+    assert any("prony explains the data about as well as prony_fluid (criterion 5.7 lower" in w for w in fit.warnings)
+
+
 def test_a_weak_solid_is_told_that_it_may_be_a_fluid():
     fit = springpots_in_time.choose_in_time(creep_of_burgers(0.06), "prony", 2)
     assert fit.kind.name == "prony"

@@ -320,7 +320,7 @@ class Predicted(NamedTuple):
     chosen: float
     second: float  # the second-best model by the criterion
     rival: float  # the best model that does not contain the chosen one as a special case
-    decided: bool  # the criterion is strong evidence against the rival
+    decided: bool  # the criterion is very strong evidence against the rival
     best: float  # the smallest error of all models
 
 

@@ -154,8 +154,9 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep, factors: compression.Shares
 
 def _of_rival_modes(fit: Fit, sweep: Sweep, factors: compression.Shares | None) -> tuple[Fit, Sweep]:
     """Return the fit of Prony modes and the sweep, both corrected for the instrument's errors, if these modes and
-    errors explain the sweep better than `fit`. Otherwise `fit` and the sweep are returned unchanged. `fit`: a model
-    without free modes. A spectrum, for example, can fit the error of the inertia as a part of the material.
+    errors explain the sweep better than `fit`. Otherwise `fit` and the sweep are returned, and only the time of the
+    computation changes. `fit`: a model without free modes. A spectrum, for example, can fit the error of the inertia as
+    a part of the material.
     """
     modes = models.rival_modes(fit)
     if modes is None:
@@ -163,7 +164,7 @@ def _of_rival_modes(fit: Fit, sweep: Sweep, factors: compression.Shares | None) 
     found, corrected = without_error_of_inertia(modes, sweep, factors)
     prior = float(np.sum(used_errors(found, sweep)[1] ** 2))
     better = corrected is not sweep and models.is_preferred(found, fit, prior)
-    return (found, corrected) if better else (fit, sweep)
+    return (found, corrected) if better else (fit._replace(run_time=found.run_time), sweep)
 
 
 def _with_more_modes(fit: Fit, sweep: Sweep) -> list[Corrected]:

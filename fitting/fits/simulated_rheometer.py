@@ -211,7 +211,7 @@ def simulation_data(sweep: Sweep, simulation: Simulation) -> tuple:
 OF_THE_DATA = (
     "modes would follow",
     "about as well as",
-    "explains the corrected data better",
+    "explains the data better",
     "would fit the data more closely",
     "no finite instantaneous",
     "that relaxes",

@@ -383,12 +383,14 @@ def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
 
 
 def _rival_kind(chosen: TimeFit, tried: list[TimeFit], test: TimeTest) -> list[str]:
-    """Return a warning if a solid is chosen, and a fluid explains the test about as well."""
-    fluids = [f for f in tried if f.kind.name == FLUID.name and identifiable(f, test)]
-    if chosen.kind.name == FLUID.name or not fluids:
+    """Return a warning if a solid is chosen and a fluid explains the test about as well, or if a fluid is chosen and a
+    solid explains the test better."""
+    others = [f for f in tried if f.kind.name != chosen.kind.name and identifiable(f, test)]
+    if not others:
         return []
-    apart = min(map(criterion, fluids)) - criterion(chosen)
-    return [choice.undecided(FLUID.name, chosen.kind.name, apart)] if apart < choice.STRONG else []
+    other = min(others, key=criterion)
+    apart, limit = criterion(other) - criterion(chosen), 0.0 if chosen.kind.name == FLUID.name else choice.STRONG
+    return [choice.undecided(other.kind.name, chosen.kind.name, apart)] if apart < limit else []
 
 
 #: Key in `TimeFit.details`: modulus [Pa], with standard error, of an elastic material that explains the test equally

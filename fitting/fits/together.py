@@ -411,8 +411,8 @@ def of_rises(chosen: Together) -> list[str]:
             continue
         out.append(
             f"no row of {test.source} shows how the load changed between {test.time[row - 1]:.4g} and "
-            f"{test.time[row]:.4g} s, so a linear change is assumed. If the change was a step, G0 and the short "
-            "relaxation times are wrong: add the rows measured during the change to the file"
+            f"{test.time[row]:.4g} s, so a linear change is assumed. If the change was a step, the moduli at "
+            "high frequencies are wrong: add the rows measured during the change to the file"
         )
     return out
 

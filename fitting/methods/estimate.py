@@ -155,16 +155,17 @@ def covering_root(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     Args:
         first, second: square roots (P, k) of the two covariances; k may differ.
     """
+    all_directions = np.zeros((len(first), len(first)))  # so that the axes below span all directions for any k
     sizes = np.maximum(np.linalg.norm(first, axis=1), np.linalg.norm(second, axis=1))
     sizes = np.where(sizes > 0, sizes, 1.0)[:, None]
-    U, s, _ = np.linalg.svd(first / sizes, full_matrices=False)
+    U, s, _ = np.linalg.svd(np.hstack([first / sizes, all_directions]), full_matrices=False)
     if not np.any(s):
         return second
     # In the coordinates with the axes U s, the first covariance is the unit matrix.
     s = np.maximum(s, _NO_SPREAD * s.max())
-    M = (U / s).T @ (second / sizes)
-    squares, axes = np.linalg.eigh(M @ M.T)
-    return sizes * ((U * s) @ axes * np.sqrt(np.maximum(squares, 1.0)))
+    M = np.hstack([(U / s).T @ (second / sizes), all_directions])
+    axes, ratios, _ = np.linalg.svd(M, full_matrices=False)  # M M^T would lose the small ratios to roundoff
+    return sizes * ((U * s) @ axes * np.maximum(ratios, 1.0))
 
 
 def wider(estimate: Estimate, direction: np.ndarray) -> Estimate:

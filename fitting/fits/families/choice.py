@@ -63,8 +63,8 @@ def undecided(second: str, chosen: str, apart: float) -> str:
     criterion of `second` minus that of `chosen`."""
     return (
         f"{second} explains the data about as well as {chosen} (criterion {abs(apart):.2g} "
-        f"{'higher' if apart >= 0 else 'lower'}; {STRONG:g} is strong evidence). The data do not decide between these "
-        "models, and their moduli may differ much outside the measured band"
+        f"{'higher' if apart >= 0 else 'lower'}; {STRONG:g} is very strong evidence). The data do not decide between "
+        "these models, and their moduli may differ much outside the measured band"
     )
 
 

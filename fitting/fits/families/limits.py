@@ -85,7 +85,7 @@ def still_relaxing(
     if fall <= max(TOLD * noise * storage[0], SLOWING * next_fall):
         return []
     return [
-        f"G' falls by {100 * fall / storage[1]:.2g} % in the lowest half decade and by "
+        f"G' of the model falls by {100 * fall / storage[1]:.2g} % in the lowest half decade of frequency and by "
         f"{100 * next_fall / storage[2]:.2g} % in the next half decade. The equilibrium modulus is the modulus after "
         f"{longest:.3g} s, the longest relaxation time of the model. It is unknown how much of this modulus relaxes "
         f"later. The stated error does not contain this part: {remedy}"

@@ -286,12 +286,14 @@ def _with_rivals(chosen: Fit, tried: list[Fit], sweep: Sweep) -> Fit:
 
 
 def rival_modes(chosen: Fit) -> Fit | None:
-    """Return the fit of free Prony modes with which `chosen` was compared, or None if there is no such fit. This fit
-    gets the table of the compared models, and the time of their computation."""
+    """Return the fit of free Prony modes with which `chosen` was compared, or None if there is no such fit. If a solid
+    and a fluid were compared, `preferred` selects one of them. The fit gets the table of the compared models, and the
+    time of their computation."""
     free = {fit.kind.name: fit for fit in chosen.rivals if fit.kind.values is None}
     if not free:
         return None
-    fit = free.get("prony", next(iter(free.values())))
+    fits = list(free.values())
+    fit = fits[preferred([label_of(f) for f in fits], [information_criterion(f) for f in fits])]
     details = fit.details | {TABLE_OF_MODELS: chosen.details[TABLE_OF_MODELS]}
     return fit._replace(details=details, run_time=chosen.run_time, compile_time=chosen.compile_time)
 
@@ -318,7 +320,8 @@ def compared_again(chosen: Fit, sweep: Sweep, at_rest: Callable[[Fit], Fit]) -> 
     dense, prony, fluids = generalised_maxwell.spectrum(sweep), chosen, viscoelastic.FLUID.name
     if chosen.kind.name == fluids:
         modes = next(row["modes"] for row in chosen.details[TABLE_OF_MODELS] if row["model"] == "prony")
-        prony = viscoelastic.closed_form(sweep, max(modes, chosen.modes), dense)
+        solids = [viscoelastic.closed_form(sweep, n, dense) for n in sorted({modes, chosen.modes})]
+        prony = min(solids, key=lambda fit: (not identifiable(fit, sweep), information_criterion(fit)))
     others = [fit for fit in every_model(sweep, "auto", prony, dense) if fit.kind.name != chosen.kind.name]
     return _with_rivals(chosen, [*(at_rest(fit) for fit in others), chosen], sweep)
 
@@ -341,6 +344,12 @@ def _compared(sweep: Sweep, tried: list[Fit]) -> list[Content]:
     return sorted(rows, key=lambda row: row["information_criterion"])
 
 
+def _is_beaten(general: Fit, special: Fit) -> bool:
+    """Return whether the model `general` contains the model `special`, and the data do not need it (`preferred`)."""
+    labels, fits = [label_of(general), label_of(special)], (general, special)
+    return contains(*labels) and preferred(labels, [information_criterion(f) for f in fits]) == 1
+
+
 def _rival_models(chosen: Fit, tried: list[Fit], able: list[Fit]) -> list[str]:
     """Return warnings in two cases: another model fits the data about equally well, or another model fits better but
     the data do not determine all its parameters."""
@@ -352,18 +361,18 @@ def _rival_models(chosen: Fit, tried: list[Fit], able: list[Fit]) -> list[str]:
             f"{best.kind.name} would fit the data more closely (criterion {apart:.2g} lower), but the data do not "
             "determine some of its parameters"
         )
-    others = [f for f in able if f is not chosen and not contains(label_of(f), label_of(chosen))]
+    others = [f for f in able if f is not chosen and not _is_beaten(f, chosen)]
     if not others:
         return out
     second = min(others, key=information_criterion)
     apart = information_criterion(second) - information_criterion(chosen)
     if apart >= STRONG:
         return out
-    if apart <= -STRONG:  # only if the data were corrected for an error that was fitted with the chosen model
+    if apart <= -STRONG:  # mostly if the data were corrected for an error that was fitted with the chosen model
         return [
             *out,
-            f"{second.kind.name} explains the corrected data better than {chosen.kind.name} (criterion {-apart:.2g} "
-            "lower; 10 is strong evidence), and their moduli may differ much outside the measured band",
+            f"{second.kind.name} explains the data better than {chosen.kind.name} (criterion {-apart:.2g} "
+            f"lower; {STRONG:g} is very strong evidence), and their moduli may differ much outside the measured band",
         ]
     return [*out, undecided(second.kind.name, chosen.kind.name, apart)]
 

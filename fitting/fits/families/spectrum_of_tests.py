@@ -185,6 +185,14 @@ def _as_a_fit(
     return SpectrumFit(kind, model, solution, spread, own, details, tuple(sentences))
 
 
+def _relative_scale(test: Measured) -> float:
+    """Return the median of the scales of a test, divided by the measured values (`together.sizes_of`). For a sweep, it
+    is the median of G' only."""
+    _, y, scales = together.reported_numbers(test)
+    count = len(y) // 2 if isinstance(test, Sweep) else len(y)
+    return float(np.median((scales / together.sizes_of(test))[:count]))
+
+
 def _still_relaxing(tests: Sequence[Measured], told: GridSpectrum, noises: np.ndarray) -> tuple[str, ...]:
     """Return a warning if G' of the spectrum still decreases at the lowest frequency that the tests resolve. `noises`:
     noise of each test, relative to its scales."""
@@ -194,7 +202,7 @@ def _still_relaxing(tests: Sequence[Measured], told: GridSpectrum, noises: np.nd
     storage, slowest = told.equilibrium + columns @ told.strengths, float(np.max(told.times, initial=0.0))
     sweeps = any(isinstance(t, Sweep) for t in tests)
     remedy = "measure longer, or at lower frequencies" if sweeps else "measure longer"
-    found = limits.still_relaxing(storage, float(noises[longest]), slowest, remedy)
+    found = limits.still_relaxing(storage, float(noises[longest]) * _relative_scale(tests[longest]), slowest, remedy)
     return tuple(found) if told.equilibrium > 0 else ()
 
 
