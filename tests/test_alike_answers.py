@@ -262,6 +262,18 @@ def test_a_clear_drift_is_told_however_large_it_becomes(end):
     assert found.slope == 0 and np.isclose(found.left, 0.02, rtol=0.02)
 
 
+def test_a_drift_with_a_mean_near_zero_is_not_called_an_offset(tmp_path):
+    """The note said that the mean is 0 % of the largest stress, and called it a sensor offset."""
+    time = np.arange(0.0, 200.0, 0.5)
+    strain = np.where(time > 5.75, 0.1, 0.0)
+    stress = strain * (600 + 400 * np.exp(-(time - 6) / 5)) + 0.05 * (time - 2.625)
+    stress += 1e-3 * np.random.default_rng(1).standard_normal(len(time))
+    table = np.column_stack([time, strain, stress])
+    np.savetxt(tmp_path / "t.csv", table, delimiter=",", header="time_s,strain,stress_Pa", comments="")
+    (note,) = (n for n in reader.read_time_test(tmp_path / "t.csv", "relaxation").notes if "rows at rest" in n)
+    assert "This mean is subtracted. But the stress changes during these rows" in note and "sensor offset" not in note
+
+
 def test_an_offset_needs_more_than_noise_of_similar_neighbours():
     """The noise was taken as independent. With a correlation of 0.8, offsets that did not exist were found in 32 %."""
     time = np.arange(-2.0, 0, 0.1)

@@ -251,9 +251,13 @@ def test_a_hyphen_between_words_is_no_sign(tmp_path, name, celsius):
     assert np.allclose(data.temperatures - 273.15, [celsius, 40])
 
 
-@pytest.mark.parametrize(("others", "known"), [((25.0, 37.0, 45.0), False), ((25.2, 25.0, 24.8), True)])
+@pytest.mark.parametrize(
+    ("others", "known"),
+    [((25.0, 37.0, 45.0), False), ((25.2, 25.0, 24.8), True), ((23.8, 23.7, 23.8), True)],
+)
 def test_the_name_of_a_table_does_not_replace_its_temperatures(tmp_path, others, known):
-    """One empty cell replaced the temperatures of all rows, 25 to 45 °C, by the 25 °C of the name."""
+    """One empty cell replaced the temperatures of all rows, 25 to 45 °C, by the 25 °C of the name. A sample may be
+    more than 1 K colder than the set temperature in the name. Then the file was refused."""
     head = "Frequency\tStorage modulus\tLoss modulus\tTemperature\nHz\tPa\tPa\t°C\n"
     rows = [f"{f}\t{1000 + f}\t{100 + f}\t{T}\n" for T in others for f in (1, 2, 3)]
     rows[1] = "2\t1002\t102\t\n"

@@ -92,6 +92,21 @@ def test_a_stiffer_sample_is_a_factor_and_waves_are_predicted_too():
     assert prediction.predict(fit, s.resolved, given).covered == 1.0
 
 
+def test_three_frequencies_show_the_noise_of_both_moduli():
+    """With three values per modulus in the band, the noise was unknown or contained the values outside the band."""
+    s, rng = sweep(0.0, 0), np.random.default_rng(0)
+    fit = viscoelastic.closed_form(s, 2)
+    for omega in (OMEGA[10:13], np.append(OMEGA[10:13], 1e4)):
+        noise = []
+        for _ in range(30):
+            G = generalised_maxwell.moduli(TRUTH, omega) * (1 + 0.03 * rng.standard_normal((2, len(omega))))
+            G[:, 3:] *= 2
+            found = prediction.predict(fit, s.resolved, Sweep(omega, *G))
+            assert 0 <= found.covered <= 1
+            noise.append(found.noise * found.scales / found.predicted)
+        assert np.isclose(np.sqrt(np.mean(np.array(noise)[:, :3] ** 2)), 0.03, rtol=0.25)
+
+
 def test_the_error_of_a_noisy_test_is_its_noise():
     """With 10 % of noise, the error was given as about 2 %, because the divisor grew with the noise."""
     test = relaxation()

@@ -63,18 +63,20 @@ def test_sorting_and_repeats_are_said(tmp_path):
 
 def test_copies_of_lines_count_once(tmp_path):
     """Each copy counted as a measurement. If every line was written twice, the interval of the equilibrium modulus was
-    a third shorter.
+    a third shorter. If only some lines are equal, they are repeated measurements with the same rounded numbers.
     """
     lines = [f"{f},{300 + 7 * f},{30 + f},{t}\n" for f, t in ((0.1, "1e-6"), (1, "2e-6"), (10, ""))]
     lines.append("1,307.5,31,2e-6\n")  # a repeated measurement
     head = HEADER.strip() + ",torque_Nm\n"
     once = read_sweep(_write(tmp_path, head + "".join(lines)))
     assert len(once.storage) == 4 and any("repeated frequencies: 1." in n for n in once.notes)
-    for copies in (lines, 2 * lines, lines[:2]):
+    for copies in (lines, 2 * lines):
         again = read_sweep(_write(tmp_path, head + "".join(lines + copies)))
         assert np.array_equal(np.stack(once[:3]), np.stack(again[:3]))
         assert any(f"{len(copies)} of {4 + len(copies)} points are ignored" in n for n in again.notes)
         assert any("repeated frequencies: 1." in n for n in again.notes)
+    rounded = read_sweep(_write(tmp_path, head + "".join(lines + lines[:2])))
+    assert len(rounded.storage) == 6 and not any("ignored" in n for n in rounded.notes)
 
 
 TRIOS = """\

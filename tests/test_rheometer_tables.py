@@ -264,3 +264,15 @@ def test_another_table_below_is_not_appended(title, tmp_path):
     assert len(found.storage) == 6
     told = any("Temperature [K]" in note and "the rows below it are not read" in note for note in found.notes)
     assert told == (not title)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize("title", ["Parameters of the fit", "Sample B\nmeasured again"])
+def test_another_block_of_numbers_below_a_title_is_not_appended(title, order, tmp_path):
+    """The numbers of this block became points of the sweep. Its frequencies do not continue those above."""
+    rows = [f"{10 ** (k / 2 - 2):.3g}\t{300 + k}\t{30 + k}\n" for k in range(9)][::order]
+    for block in (["1\t100\t0.1\n", "2\t200\t1\n"], rows):
+        text = "Frequency [Hz]\tG' [Pa]\tG'' [Pa]\n" + "".join(rows) + title + "\n" + "".join(block)
+        found = read_sweep(_write(tmp_path, text, "t.txt"))
+        assert len(found.storage) == 9
+        assert any(title.split("\n")[0] in n and "the rows below it are not read" in n for n in found.notes)

@@ -147,6 +147,15 @@ def test_too_few_balances_and_a_length_in_millimetres_are_refused(tmp_path, caps
     assert "--length 4 m is much longer than the organ (0.016 m)" in capsys.readouterr().err
 
 
+def test_notes_and_the_length_come_before_the_search(tmp_path, capsys, monkeypatch):
+    """They came after the factorisations for the typical modulus, which need minutes in a large organ."""
+    monkeypatch.setattr(elastography, "organ_of", lambda *_: pytest.fail("the search began"))
+    field = plane_waves((7, 7, 9), noise=1e-7)
+    path = written(tmp_path, ".npz", field)
+    assert command.main(["waves", str(path), "--out", str(tmp_path / "out"), "--length", "4"]) == 2
+    assert "--length 4 m is much longer than the organ (0.016 m)" in capsys.readouterr().err
+
+
 def test_a_progress_file_that_is_none_gets_a_sentence(tmp_path):
     """The files are a text, and an HDF5 file of another program."""
     own = organ()

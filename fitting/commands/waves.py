@@ -18,6 +18,8 @@ from liverjax.core.files import writable
 if TYPE_CHECKING:
     from fitting.waves.elastography import Organ
     from fitting.waves.kept_regions import Keep
+    from fitting.waves.voxels import VoxelBody
+    from fitting.waves.wave_field import WaveField
 
 FILES = ("waves.json", "waves.h5", "waves.vtu", "waves.png", "progress.h5", "progress_of_regions.h5")
 #: MOST_MEMORY: maximum memory of one matrix factor [GB]. A body that needs more is divided into parts, or the grid is
@@ -95,14 +97,14 @@ def run(options: argparse.Namespace) -> int:
     )
     field = wave_field.with_noise(field, options.noise)
     writable(options.out, FILES)
-    with _forces_that_balance(options.data):
-        organ = _organ(options, field)
+    coarse, body = _coarse_and_body(options, field)
     if not options.no_map:
-        _check_length_of_map(options.length, organ)
+        _check_length_of_map(options.length, body)
     for note in field.notes:
         print(f"note: {note}", file=sys.stderr)
     bar, told = cost_bar("steps")
     with bar, _forces_that_balance(options.data):
+        organ = elastography.organ_of(coarse, body, options.density)
         found = elastography.regions_of(organ, told, _kept_regions(options, organ))
         drawn = None
         if not options.no_map:
@@ -121,8 +123,8 @@ def run(options: argparse.Namespace) -> int:
     return 0 if good and (drawn is None or drawn.distance <= stiffness_map.FAR) else 1
 
 
-def _check_length_of_map(length: float | None, organ: "Organ") -> None:
-    size = float(np.ptp(np.asarray(organ.body.mesh.points), axis=0).max())
+def _check_length_of_map(length: float | None, body: "VoxelBody") -> None:
+    size = float(np.ptp(np.asarray(body.mesh.points), axis=0).max())
     if length is not None and length > LONGEST * size:
         raise InputError(
             f"--length {length:g} m is much longer than the organ ({size:.2g} m), so the map would be uniform: give "
@@ -157,9 +159,9 @@ def _forces_that_balance(data: Path) -> Iterator[None]:
         ) from None
 
 
-def _organ(options: argparse.Namespace, field) -> "Organ":
-    """Return the organ with the body of its voxels. A body that is too large is divided into parts. If this is not
-    enough, the voxels are made coarser."""
+def _coarse_and_body(options: argparse.Namespace, field: "WaveField") -> tuple["WaveField", "VoxelBody"]:
+    """Return the field to fit and the body of its voxels. A body that is too large is divided into parts. If this is
+    not enough, the voxels are made coarser."""
     from fitting.waves import elastography, wave_field
 
     stride = options.stride or 1
@@ -185,7 +187,7 @@ def _organ(options: argparse.Namespace, field) -> "Organ":
         )
     for note in (*elastography.notes_on_gaps(coarse), *elastography.notes_on_layers(coarse)):
         print(f"note: {note}", file=sys.stderr)
-    return elastography.organ_of(coarse, body, options.density)
+    return coarse, body
 
 
 def _check_waves(options: argparse.Namespace) -> None:

@@ -117,8 +117,8 @@ def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, flo
                 "temperature_C"
             )
         of_name = float(stated[1].replace(",", ".")) + 273.15 * (stated[2] == "C") if stated else np.nan
-        # A name with one temperature does not tell the missing temperatures of a table with others.
-        if not np.all(np.abs(T[~missing] - of_name) < SAME):
+        # One temperature in the name cannot replace missing temperatures if the other rows differ from each other.
+        if not np.isfinite(of_name) or (not np.all(missing) and np.ptp(T[~missing]) >= SAME):
             raise InputError(
                 f"{path}: the temperature of {missing.sum()} of {len(T)} rows is missing; fill in these cells, or "
                 "remove these rows"

@@ -29,7 +29,8 @@ class BaseLine(NamedTuple):
 
 
 def base_line(time: np.ndarray, answer: np.ndarray, size: float, end: float, rounding: float = 0.0) -> BaseLine | None:
-    """Return the base line that the rows at rest (n,) show, or None if it is not clearly different from 0.
+    """Return the base line that the rows at rest (n,) show, or None if it is not clearly different from 0 and does
+    not clearly drift.
 
     Args:
         time: times [s] (n,) of these rows, counted from the beginning of the load.

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fitting.readers import raw_torque
+from fitting.readers.tables.text_tables import without_multiples
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
@@ -291,12 +292,12 @@ def some(sweep: Sweep, kept: np.ndarray) -> Sweep:
 
 
 def without_copies(sweep: Sweep) -> Sweep:
-    """Return the sweep without points that are copies of earlier points: all their numbers are the same. A copy is no
-    new measurement. A note reports the number of copies."""
+    """Return the sweep without copies of points (`without_multiples`). A copy is no new measurement. A note reports the
+    number of copies."""
     columns = (sweep.angular_frequency, sweep.storage, sweep.loss, sweep.storage_sd, sweep.loss_sd)
     every = [*(v for v in columns if v is not None), *(sweep.raw or {}).values()]
     rows = np.nan_to_num(np.column_stack(every), nan=np.inf)  # an empty cell equals an empty cell
-    kept = np.isin(np.arange(len(rows)), np.unique(rows, axis=0, return_index=True)[1])
+    kept = np.isin(np.arange(len(rows)), without_multiples([tuple(row) for row in rows.tolist()]))
     if kept.all():
         return sweep
     note = f"{(~kept).sum()} of {len(kept)} points are ignored, because they are copies of other points"

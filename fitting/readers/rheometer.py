@@ -35,9 +35,9 @@ def read_sweep(path: str | os.PathLike, table: str | None = None) -> Sweep:
     """Read a frequency sweep.
 
     A point is ignored if a modulus or the frequency is not finite, not positive, or outside of `SMALLEST` to
-    `LARGEST`. A note names these points. A point is also ignored if it is a copy of another point: a line with the same
-    numbers in all columns that are used. Standard deviations are not used if too many of them are empty or not
-    positive.
+    `LARGEST`. A note names these points. If every line was written several times, the copies are ignored too: lines
+    with the same numbers in all columns that are used. Standard deviations are not used if too many of them are empty
+    or not positive.
 
     Args:
         path: an instrument's export, or text with a header that names ``frequency_Hz`` or ``angular_frequency_rad_s``,

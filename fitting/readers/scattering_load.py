@@ -113,7 +113,7 @@ def _straight_ramp(
     start, spacing = time[[before, first]], (time[first] - time[before]) / (first - before)
 
     def misfit(later: np.ndarray) -> float:
-        """Return the misfit if the ramp begins and ends `later` (2,) than `start`. The unit of `later` is `spacing`."""
+        """Return the misfit if begin and end of the ramp (`start`) are moved by `later` (2,), in units of `spacing`."""
         begin, end = start + spacing * later
         return float(np.sum(((line_from(begin, end, low) - driven) / noise) ** 2))
 

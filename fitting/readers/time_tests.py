@@ -491,11 +491,14 @@ def _without_base_line(test: TimeTest) -> tuple[TimeTest, list[str]]:
             "shows how the drift continues under load, so the errors allow for half of it"
         )
     else:
-        told = (
-            f"the {what} of {count} rows at rest is {line.level:.3g}{unit} on average, which is "
-            f"{100 * abs(line.level) / size:.2g} % of the largest {what} (absolute value): this sensor offset is "
-            "subtracted"
-        )
+        told = f"the {what} of {count} rows at rest is {line.level:.3g}{unit} on average"
+        if abs(line.level) > OFFSET * size:
+            told += (
+                f", which is {100 * abs(line.level) / size:.2g} % of the largest {what} (absolute value): this sensor "
+                "offset is subtracted"
+            )
+        else:
+            told += ". This mean is subtracted"
         if line.left:
             told += (
                 f". But the {what} changes during these rows, by {line.left:.2g}{unit} per second: the sensor may "

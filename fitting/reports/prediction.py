@@ -89,20 +89,29 @@ def predict(fit: Fit, resolved: tuple[float, float], test: Measured) -> Predicti
     if isinstance(test, TimeTest):
         sizes = time_tests.sizes_of_prediction(measured, predicted, sizes, test.rounding)
     off, parts = (predicted - measured) / scales, len(series_of(test))
-    rows = zip(np.split(off, parts), np.split(inside, parts), strict=True)
-    noise = np.repeat([_scatter_around(*row, test) for row in rows], len(off) // parts)
+    noise = _scatter_around(off.reshape(parts, -1), inside.reshape(parts, -1), test).ravel()
     own = (errors, scales, sizes, inside, noise, fit.uncertainty.quantile)
     return Prediction(name_of(test), test.source, predicted, measured, *own)
 
 
-def _scatter_around(off: np.ndarray, inside: np.ndarray, test: Measured) -> float:
-    """Return the noise of one series of a test (`series_of`), divided by its scales. It is estimated from the k
-    differences `off` (k,) between prediction and test. Those outside the band are used only if fewer than four are
-    `inside` (k,). NaN for fewer than four values without deviations."""
-    off = off[inside] if inside.sum() >= 4 else off
+def _scatter_around(off: np.ndarray, inside: np.ndarray, test: Measured) -> np.ndarray:
+    """Return the noise (s, k) of the values of a test with s series (`series_of`), divided by the scales.
+
+    It is estimated from the differences `off` (s, k) between prediction and test: for each series if four values or
+    more are `inside` (s, k) the band, and otherwise from the second differences of all series together. If there are
+    fewer than two second differences in the band, the values outside are used too. NaN for fewer than four values
+    without deviations."""
+    rows = [own[counted] for own, counted in zip(off, inside, strict=True)]
+    bends = np.concatenate([np.diff(row, 2) for row in rows])
+    fewest = min(map(len, rows))
+    if fewest < 4 and len(bends) > 1:  # a second difference has 6 times the variance of the noise
+        found = [float(np.sqrt(np.mean(bends**2) / 6))] * len(rows)
+    else:
+        every = rows if fewest >= 4 else off
+        found = [noise_of_series(row) if len(row) >= 4 else np.nan for row in every]
     if isinstance(test, Sweep) and test.noise_given:
-        return max(1.0, noise_of_series(off))
-    return noise_of_series(off) if len(off) >= 4 else np.nan
+        found = [float(np.fmax(1.0, each)) for each in found]
+    return np.repeat(np.array(found)[:, None], off.shape[1], axis=1)
 
 
 def sentence(found: Prediction) -> str:

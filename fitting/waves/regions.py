@@ -18,7 +18,7 @@ from fitting.waves.edges import RegionMatrices
 #: shear waves with these moduli go from WAVE_VOXELS voxels to WAVE_BODIES lengths of the body. MODULI_APART: largest
 #: ratio between two neighbouring moduli. ROUGHLY: the best modulus is then found with this relative accuracy. LOSS:
 #: ratio of loss to storage modulus at the starting point.
-WAVE_VOXELS, WAVE_BODIES, MODULI_APART, ROUGHLY, LOSS = 4.0, 6.0, 3.0, 0.1, 0.3
+WAVE_VOXELS, WAVE_BODIES, MODULI_APART, ROUGHLY, LOSS = 4.0, 6.0, 3.0, 0.3, 0.3
 #: ITERATIONS: maximum number of iterations. ENOUGH: the iterations end if the next change of each modulus, divided by
 #: the standard error of this modulus, is below this value.
 ITERATIONS, ENOUGH = 20, 0.1
@@ -78,7 +78,8 @@ class _State(NamedTuple):
 
 def first_modulus(m: Matrices, waves: MeasuredWaves, density: float, voxel: float, length: float) -> float:
     """Return a rough storage modulus [Pa] of the whole body, from which the search for the moduli starts: the modulus
-    with the lowest chi^2 at the lowest frequency. The loss modulus is `LOSS` times the storage modulus.
+    with the lowest chi^2 at the frequency whose motion is the largest relative to its noise. The loss modulus is `LOSS`
+    times the storage modulus.
 
     The moduli that are tried follow from the wavelengths that the voxels can show. So they have the right size for all
     units of the data.
@@ -90,15 +91,17 @@ def first_modulus(m: Matrices, waves: MeasuredWaves, density: float, voxel: floa
         voxel: smallest distance between neighbouring voxels [m].
         length: longest side of the body [m].
     """
-    ends = density * (waves.omega[0] / (2 * np.pi) * np.array([WAVE_VOXELS * voxel, WAVE_BODIES * length])) ** 2
+    clearest = int(np.argmax(np.mean(np.abs(waves.motion) ** 2, axis=1) / waves.sd**2))
+    omega, motion, sd = waves.omega[clearest], waves.motion[clearest], waves.sd[clearest]
+    ends = density * (omega / (2 * np.pi) * np.array([WAVE_VOXELS * voxel, WAVE_BODIES * length])) ** 2
     number = 1 + math.ceil(math.log(ends[1] / ends[0]) / math.log(MODULI_APART))
     every = np.ones(m.rows.shape[-1])
 
     def out_of_balance(logarithm: float) -> float:
         modulus = math.exp(logarithm)
         # With the equations multiplied by this ratio, chi^2 is that for the pressure term of each modulus.
-        C = balance.rows_of_balance(m, modulus * (1 + LOSS * 1j) * every, waves.omega[0]) * (m.typical / modulus)
-        return balance.likeliest(C, m.pressure, waves.motion[0], waves.sd[0]).chi2
+        C = balance.rows_of_balance(m, modulus * (1 + LOSS * 1j) * every, omega) * (m.typical / modulus)
+        return balance.likeliest(C, m.pressure, motion, sd).chi2
 
     tried = np.log(np.geomspace(ends[0], ends[1], number))
     best = int(np.argmin([out_of_balance(each) for each in tried]))

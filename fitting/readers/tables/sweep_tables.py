@@ -270,7 +270,8 @@ def _rows_below(path, columns, lines, k, delimiter, width):
             continue
         cells = split_cells(line, delimiter)
         words = _is_words(cells, needed)
-        if words and every and delimiter == "\t" and _is_remark(lines, k, needed):
+        following = _row_after(lines, k, needed) if words and every and delimiter == "\t" else None
+        if following is not None and _continues(every, following, needed):
             k += 1
             notes.append(f"line {k}, {_line_shown(line)}, has no numbers and is ignored")
             continue
@@ -278,7 +279,8 @@ def _rows_below(path, columns, lines, k, delimiter, width):
             not every or line.startswith("[") or delimiter == "\t" or not _goes_on(lines, k, delimiter, needed)
         ):
             below = "".join(lines[k + 1 : k + 2])
-            if every and delimiter == "\t" and not _complete(line) and _has_all_numbers(below, needed):
+            unread = following is not None or (delimiter == "\t" and _has_all_numbers(below, needed))
+            if every and unread and not _complete(line):
                 notes.append(f"line {k + 1}, {_line_shown(line)}, has no numbers, and the rows below it are not read")
             break  # the header was only a title, or this table ends
         k += 1
@@ -314,17 +316,33 @@ def _has_all_numbers(line: str, needed: list[Column]) -> bool:
     return not any(means_nothing([cell]) for cell in _needed_cells(line, needed))
 
 
-def _is_remark(lines: list[str], k: int, needed: list[Column]) -> bool:
-    """Return whether whole rows of the same table follow below line k, which has no numbers. The cells are separated by
-    tabs. Words in two of the needed columns are headings of another table."""
+def _row_after(lines: list[str], k: int, needed: list[Column]) -> str | None:
+    """Return the next whole row of numbers below line k, which has no numbers. Return None if there is no such row
+    above the next table. The cells are separated by tabs. Words in two of the needed columns are headings of another
+    table."""
     for line in lines[k:]:
         if _has_all_numbers(line, needed):
-            return True
+            return line
         own = _needed_cells(line, needed)
         headings = means_nothing(own) and sum(cell.lower() not in EMPTY for cell in own) > 1
         if headings or line.startswith("[") or _complete(line):
-            return False
-    return False
+            return None
+    return None
+
+
+def _continues(rows: list[list[str]], line: str, needed: list[Column]) -> bool:
+    """Return whether the frequency of a line continues the rows above it: it rises or falls like the last frequencies.
+    Otherwise the line may begin another block of numbers. The cells of the line are separated by tabs."""
+    place = next(c.place for c in needed if c.quantity == "frequency")
+    cells = [row[place] for row in [*rows, split_cells(line, "\t")] if place < len(row)]
+    sign = decimal_sign(cells)
+    found = [to_number(cell, "\t", sign) for cell in cells]
+    known = [value for value in found if value is not None and np.isfinite(value)]
+    if len(known) < 3:
+        return True  # one frequency above the line shows no direction
+    *above, last, here = known
+    before = next((value for value in reversed(above) if value != last), last)
+    return (here - last) * (last - before) >= 0
 
 
 def _goes_on(lines: list[str], k: int, delimiter: str, needed: list[Column]) -> bool:
