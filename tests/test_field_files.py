@@ -147,7 +147,7 @@ def test_the_progress_of_an_earlier_map_does_not_stay(tmp_path, monkeypatch, cap
     out.mkdir()
     (out / "progress.h5").write_text("another map")
     assert main([*command, "--resume"]) == 130
-    assert "stopped; finished parts are kept: continue with --resume\n" in capsys.readouterr().err
+    assert "stopped; continue with --resume\n" in capsys.readouterr().err
     assert main(command) == 130
     assert capsys.readouterr().err.endswith("\nstopped\n") and not (out / "progress.h5").exists()
 

@@ -126,7 +126,7 @@ def test_a_stopped_run_goes_on_to_the_same_numbers(scene, tmp_path, monkeypatch,
     with monkeypatch.context() as patch:
         _stop_after(patch, 2)
         assert main([*command, str(stopped)]) == 130
-        assert "finished parts are kept: continue with --resume" in capsys.readouterr().err
+        assert "stopped; continue with --resume" in capsys.readouterr().err
     assert not (stopped / "result.h5").exists()
     assert main([*command, str(stopped)]) == 2
     assert "unfinished run: continue with --resume" in capsys.readouterr().err

@@ -131,10 +131,10 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     how = field.MapOptions(
         max_iterations=options.iterations or _ITERATIONS, file=file, resume=options.resume, progress=told
     )
-    if not options.resume:
-        file.unlink(missing_ok=True)  # this file is from an earlier run
     problem, beside = scene_numbers.with_discretisation_as_noise(problem)
     _tell_sizes(problem, beside)
+    if not options.resume:
+        file.unlink(missing_ok=True)  # this file is from an earlier run
     with bar, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="the effect of the (mesh error|time step)")  # already given
         found = field.estimate(problem, name, length, how)

@@ -16,6 +16,8 @@ from liverjax.core.errors import InputError
 #: Temperatures that differ by less than this [K] are regarded as one temperature, because the temperature of an
 #: instrument varies by some tenths of a kelvin.
 SAME = 1.0
+#: The measured temperatures of a table and the temperature in its name differ by at most this [K].
+OFF_NAME = 5.0
 
 
 class AtTemperatures(NamedTuple):
@@ -117,8 +119,9 @@ def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, flo
                 "temperature_C"
             )
         of_name = float(stated[1].replace(",", ".")) + 273.15 * (stated[2] == "C") if stated else np.nan
-        # One temperature in the name cannot replace missing temperatures if the other rows differ from each other.
-        if not np.isfinite(of_name) or (not np.all(missing) and np.ptp(T[~missing]) >= SAME):
+        # The name cannot replace missing temperatures if the other rows differ from each other, or much from the name.
+        known = T[~missing]
+        if not np.isfinite(of_name) or (known.size and (np.ptp(known) >= SAME or np.ptp([*known, of_name]) > OFF_NAME)):
             raise InputError(
                 f"{path}: the temperature of {missing.sum()} of {len(T)} rows is missing; fill in these cells, or "
                 "remove these rows"

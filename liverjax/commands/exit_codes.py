@@ -71,7 +71,7 @@ def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namesp
             results that come from an earlier run. If it has `resume`, then `kept` is a function of `options` that
             returns the files from which an interrupted run can be continued.
     """
-    out, err = _Unbroken(sys.stdout), _Unbroken(sys.stderr)
+    out, err = (stream if stream is None else _Unbroken(stream) for stream in (sys.stdout, sys.stderr))
     with warnings.catch_warnings(), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
         begin = time.time()
@@ -79,13 +79,13 @@ def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namesp
             with program_cache.kept_on_disk():
                 code = run(options)
             _tell_of_earlier_files(options, begin)
-            out.flush()
+            print(end="", flush=True)
             return code
         except InputError as error:
             print(f"error: {error}", file=sys.stderr)
             return UNUSABLE
         except KeyboardInterrupt:
-            kept = "; finished parts are kept: continue with --resume" if _any_kept(options, begin) else ""
+            kept = "; continue with --resume" if _any_kept(options, begin) else ""
             print(f"stopped{kept}", file=sys.stderr)
             return STOPPED
         except OSError as error:
@@ -100,7 +100,7 @@ def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namesp
             return UNUSABLE
         finally:
             with contextlib.suppress(OSError):
-                out.flush()
+                print(end="", flush=True)
 
 
 def end_if_stopped(code: int) -> None:
@@ -112,7 +112,7 @@ def end_if_stopped(code: int) -> None:
     if code in (STOPPED, UNUSABLE):
         for stream in (sys.stdout, sys.stderr):
             with contextlib.suppress(OSError):  # the disk of the output is full
-                stream.flush()
+                print(end="", file=stream, flush=True)
         os._exit(code)
 
 

@@ -3,11 +3,13 @@
 A progress file contains marks (digests) of its problem, so that a run continues only from a file of the same problem.
 """
 
+import glob
 import hashlib
 import os
 import tempfile
+import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -34,14 +36,23 @@ def writable(out: Path, files: tuple[str, ...]) -> None:
         raise InputError(f"--out {out} cannot be used ({error.strerror}): name a folder that can be written") from None
 
 
+#: Age [s] after which a temporary file must be from a killed process.
+OLD = 86400.0
+
+
 @contextmanager
 def whole(file: Path) -> Iterator[Path]:
     """Yield a temporary path next to `file`. At the end of the context, the temporary file is renamed to `file`.
 
     If the process is killed or an error occurs, `file` does not change. After an error the temporary file is removed.
-    The temporary name contains the number of the process, so that several processes can write `file`.
+    The temporary name contains the number of the process, so that several processes can write `file`. Temporary files
+    of killed processes are removed if they are older than `OLD`.
     """
     beside = file.with_suffix(f".{os.getpid()}.part")
+    for left in file.parent.glob(f"{glob.escape(file.stem)}.*.part"):
+        with suppress(OSError):  # another process may remove it too
+            if left.stat().st_mtime < time.time() - OLD:
+                left.unlink()
     try:
         yield beside
         beside.replace(file)

@@ -134,8 +134,15 @@ def value_at(value: object, time: Number, times: Any, history: Any) -> Any:
     return now if now.ndim else jnp.asarray(value, now.dtype) * now
 
 
-def integral_of(value: Number, begin: Number, end: Number, times: Numbers, history: Numbers) -> jax.Array:
-    """Return the time integral from `begin` to `end` [s] of `value` times the factor of its history."""
-    inside = jnp.clip(jnp.asarray(times), begin, end)
-    at = jnp.concatenate([jnp.atleast_1d(begin), inside, jnp.atleast_1d(end)]).astype(inside.dtype)
-    return jnp.asarray(value, inside.dtype) * jnp.trapezoid(jnp.interp(at, times, history), at)
+def integral_of(value: Number, begin: Number, dt: Number, times: Numbers, history: Numbers) -> jax.Array:
+    """Return the time integral of `value` times the factor of its history, from `begin` to `begin` + dt [s].
+
+    Each line between two times of the history is integrated alone, so that derivatives are also right if a step ends at
+    one of these times.
+    """
+    t, factors = jnp.asarray(times) - begin, jnp.asarray(history)
+    inside = jnp.clip(t, 0.0, dt)
+    low, high = inside[:-1], inside[1:]
+    middles = factors[:-1] + jnp.diff(factors) / jnp.diff(t) * (0.5 * (low + high) - t[:-1])
+    ends = factors[0] * inside[0] + factors[-1] * (dt - inside[-1])  # the history is constant outside its times
+    return jnp.asarray(value, t.dtype) * (ends + jnp.sum((high - low) * middles))

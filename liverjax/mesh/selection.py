@@ -67,7 +67,7 @@ def select(
 
 def _warn_of_millimetres(x: np.ndarray, key: str, bound: float, name: str) -> None:
     """Warn if a bound excludes no node and is far outside of the mesh, but would lie within it if it were in
-    millimetres. A power of ten up to 1 m gives no warning, because people use it to select everything."""
+    millimetres. 0.01, 0.1 and 1 m give no warning, because people use them to select everything."""
     low, high = x.min(), x.max()
     idle = bound > high if key.endswith("max") else bound < low
     far = abs(bound) > FAR_OUTSIDE * max(abs(low), abs(high)) and abs(bound) not in (0.01, 0.1, 1.0)

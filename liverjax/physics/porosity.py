@@ -249,7 +249,7 @@ def _volume_per_area(inlet: Inlet, time: Number, dt: Number) -> Number:
     assert inlet.flux is not None
     if inlet.history is None or inlet.times is None:
         return dt * inlet.flux
-    return history.integral_of(inlet.flux, time - dt, time, inlet.times, inlet.history)
+    return history.integral_of(inlet.flux, time - dt, dt, inlet.times, inlet.history)
 
 
 def inflow(porosity: Porosity, mesh: TetMesh, time: Number, dt: Number) -> tuple[jax.Array, jax.Array]:
