@@ -272,9 +272,9 @@ def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str,
     """Return the Prony modes of a typical sample, whose parameters are the means of the populations. Modes without a
     mean are not included. For other parameters without a mean, the median of the samples is used.
 
-    The equilibrium modulus of Prony modes is also the mean of the population (0 if fewer than two samples determine
-    it): the mean ratios are multiplied by one factor, because their sum alone would give another equilibrium modulus.
-    This is not done if a mode has no mean."""
+    The equilibrium modulus of Prony modes is also the mean of the population (0 if no sample determines it): the mean
+    ratios are multiplied by one factor, because their sum alone would give another equilibrium modulus. This is not
+    done if a mode has no mean, or if only one sample determines the equilibrium modulus."""
     kind, every = fits[0].kind, [values_of_sample(f) for f in fits]
     middle = {n: float(np.median([row.get(n, (0.0,))[0] for row in every])) for n in populations}
     mean = {name: p.mean for name, p in populations.items() if p is not None}
@@ -285,7 +285,9 @@ def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str,
         ratios, times = (np.array([mean[f"{n}[{k}]"] for k in known]) for n in ("ratios", "relaxation_times"))
         rest = mean.get("equilibrium_modulus", 0.0) / mean["shear_modulus"]
         factor = (1 - max(rest, 1e-9)) / max(ratios.sum(), 1e-300)
-        ratios = ratios * (factor if rest < 1 and len(known) == fits[0].modes else min(1.0, factor))
+        value, error = np.array([row.get("equilibrium_modulus", (0.0, np.inf)) for row in every]).T
+        decided = rest < 1 and (rest > 0 or not np.any(value > 2 * error))
+        ratios = ratios * (factor if decided and len(known) == fits[0].modes else min(1.0, factor))
         return Maxwell(mean["shear_modulus"], ratios, times)  # type: ignore[arg-type]
     low, high = min(s.angular_frequency[0] for s in sweeps), max(s.angular_frequency[-1] for s in sweeps)
     if kind.effective is not None:

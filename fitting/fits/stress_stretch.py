@@ -212,9 +212,9 @@ def assessed(
         compile_time=times[1],
         limits=limits,
     )
-    told = _warnings(result, curves, s, bool(np.any(r[n:] < 0))) + out_of_bounds(candidate, values, limits)
-    told += _of_noise(alike, factors, n, len({c.sample or c.label for c in curves}))
-    told += _of_hidden_factors(factors, np.array(candidate.names)[known], values[known], errors[known])
+    told = [*_warnings(result, curves, s, bool(np.any(r[n:] < 0))), *out_of_bounds(candidate, values, limits)]
+    told += _of_noise(alike, factors, n, tests := len({c.sample or c.label for c in curves}))
+    told += _of_hidden_factors(factors, tests, np.array(candidate.names)[known], values[known], errors[known])
     if of_tests and not limits:
         told += _of_other_minima(candidate, values, np.asarray(found.u)[costs <= lowest], scale, curves)
     return result._replace(warnings=told)
@@ -236,8 +236,11 @@ def _of_other_minima(
     return of_other_minima(candidate.names, candidate.law, values, every, np.concatenate([c.F for c in curves]))
 
 
-#: First words of the warning about factors that multiply the stress of each test.
-OWN_FACTORS = "the stress of each test seems to be multiplied by an individual factor"
+#: First words of the warning about factors that multiply the stress of each test, or of all tests of a file.
+OWN_FACTORS = ("the stress of each test seems", "the stress of each file seems")
+#: If the residuals show factors, those of tests and those of files are both used if their likelihoods (logarithms)
+#: differ by less than this.
+_AS_LIKELY = 2.0
 
 
 def _of_noise(alike: Alike | None, factors: list[FactorNoise], n: int, tests: int) -> list[str]:
@@ -252,21 +255,21 @@ def _of_noise(alike: Alike | None, factors: list[FactorNoise], n: int, tests: in
         )
     own = max((f for f in factors if f.shown), key=lambda f: f.gain, default=None)
     if own is not None:
-        source = "tests" if own.series == tests else "files, because all tests of a file seem to have the same factor"
+        of_tests = own.series == tests
         told.append(
-            f"{OWN_FACTORS}. These factors scatter by {100 * own.deviation:.2g} %, for example due to different "
-            "samples or wrong sizes of the samples. The standard errors contain this scatter (estimated from "
-            f"{own.series} {source})"
+            f"{OWN_FACTORS[0 if of_tests else 1]} to be multiplied by an individual factor. These factors scatter by "
+            f"{100 * own.deviation:.2g} %, for example due to different samples or wrong sizes of the samples. The "
+            f"standard errors contain this scatter (estimated from {own.series} {'tests' if of_tests else 'files'})"
         )
     return told
 
 
 def _of_hidden_factors(
-    every: list[FactorNoise], names: np.ndarray, values: np.ndarray, errors: np.ndarray
+    every: list[FactorNoise], tests: int, names: np.ndarray, values: np.ndarray, errors: np.ndarray
 ) -> list[str]:
     """Return a warning about factors that may multiply the stress of each test. The residuals do not show such factors,
     because the parameters compensate for these factors."""
-    if not every or any(own.shown for own in every):
+    if not every or every[0].series != tests or any(own.shown for own in every):
         return []
     factors = every[0]
     much = (factors.moves > _HIDDEN * errors) & (factors.moves > _MOVED * np.abs(values))
@@ -316,7 +319,9 @@ def _errors_of_law(
         factors = factors_of_groups(groupings, counts, J, misfit, fitted, slope) if of_tests else []
     if alike is not None:
         roots.append(slope @ alike.root)
-    for root in [*roots, *(own.root for own in factors)]:
+    shown = [own.gain for own in factors if own.shown]
+    used = [own for own in factors if own.gain > max(shown, default=0.0) - _AS_LIKELY or not shown]
+    for root in [*roots, *(own.root for own in used)]:
         half = covering_root(half, np.clip(np.where(np.isfinite(root), root, LOST), -LOST, LOST))
     return *errors_and_correlation(half), alike, factors
 

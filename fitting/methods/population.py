@@ -34,7 +34,8 @@ UNSURE = 0.25
 BELOW = 1e-3
 #: A value with an additive error is near 0 if it is below three times its error, and below this fraction of the median.
 NEAR_ZERO = 0.1
-#: A value near 0 is part of the population only if its error, divided by the median, exceeds this value.
+#: A value near 0 is part of the population only if it may be larger than `NEAR_ZERO` times the median, or if its error,
+#: divided by the median, exceeds this value.
 MAY_BE_ZERO = 0.2
 #: Largest number of rounds in which the moved values and the population are computed in turn.
 ROUNDS_OF_MOVING = 50
@@ -52,8 +53,8 @@ class Population(NamedTuple):
 
 
 def population(values: np.ndarray, errors: np.ndarray, additive: bool = False) -> Population | None:
-    """Estimate mean and spread of the population from positive values (n,) with standard errors (n,). Returns None if
-    fewer than two values are determined. `additive`: the errors do not grow with the values, and a
+    """Estimate mean and spread of the population from values (n,), which are not negative, with standard errors (n,).
+    Returns None if fewer than two values are determined. `additive`: the errors do not grow with the values, and a
     value may be 0 (`_as_logarithms`)."""
     values, errors = np.asarray(values, float), np.asarray(errors, float)
     if values.ndim != 1 or values.shape != errors.shape or np.any(errors < 0):
@@ -110,11 +111,12 @@ def _with_errors_of_zeros(values: np.ndarray, errors: np.ndarray, known: np.ndar
     used only if its error is so large that a sample of this population may have this value. Otherwise, the sample is of
     another material."""
     clear = known & (values > 2 * errors)
-    typical = np.median(values[clear if clear.any() else known])
+    typical = min(np.median(values[part]) for part in (known, clear) if part.any())
     of_zero = np.where(values <= BELOW * typical, np.median(errors[known]), np.inf)
     own = np.where(np.isfinite(errors), errors, of_zero)
     away = known & (values > np.minimum(3 * errors, NEAR_ZERO * typical))
-    return np.where(away | (own > MAY_BE_ZERO * typical), own, np.inf)
+    possible = (own > MAY_BE_ZERO * typical) | (known & (values + 2 * own > NEAR_ZERO * typical))
+    return np.where(away | possible, own, np.inf)
 
 
 def _as_logarithms(values: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -134,7 +134,7 @@ def warnings(found: Samples) -> list[str]:
     """Return warnings about the population. For each kind of warning about single samples, also return a sentence that
     counts the samples with this warning."""
     out, of_modes = [], found.kind.values is None
-    fluid = of_modes and np.sum(found.typical.ratios) > 1 - FLUID_BELOW
+    fluid = np.sum(found.typical.ratios) > 1 - FLUID_BELOW
     for name, p in found.populations.items():
         own = np.array([found.values(k)[name][0] for k in range(len(found.fits))])
         if name.startswith("strengths["):

@@ -137,7 +137,7 @@ def out_of_bounds(candidate: Candidate, values: np.ndarray, limits: Collection[s
         try:
             bounds.check_bound(name, metadata, value)
         except InputError:
-            if name not in limits:
+            if name not in limits and np.isfinite(value):
                 told.append(
                     f"{name} = {value:.4g} is out of the bounds of the law, so scenes refuse it: use a law without "
                     "this parameter, or change the bounds of the law"
