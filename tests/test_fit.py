@@ -296,7 +296,8 @@ def test_a_shift_by_inertia_is_not_called_discretisation():
 
 def test_the_larger_of_mesh_and_time_steps_is_named_for_each_parameter():
     own = SimpleNamespace(mesh_bias=np.array([-50.0, 1e-4]), time_step_bias=np.array([5.0, 1e-3]))
-    simulated, closed = SimpleNamespace(details={}, uncertainty=own), SimpleNamespace(details={})
+    simulated = SimpleNamespace(details={}, uncertainty=own, parameters=None)
+    closed = SimpleNamespace(details={})
     causes = [simulated_rheometer._cause(closed, simulated, k)[0] for k in (0, 1)]
     assert "the mesh" in causes[0] and "discretisation" in causes[1]
 
