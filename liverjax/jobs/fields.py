@@ -12,10 +12,14 @@ import numpy as np
 
 from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
+from liverjax.core.struct import Number
 from liverjax.elements.gradients import volume_gradients
+from liverjax.laws.base import isochoric_part
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End
 from liverjax.physics.registry import law_at_rest
+from liverjax.physics.volumes.averaged import Averaged
+from liverjax.physics.volumes.mixed import Mixed
 from liverjax.scenes.scene import Scene
 from liverjax.simulation.equations import Equations, Sizes, State, advanced, equations, force_sizes, initial_state
 from liverjax.simulation.run import Result, prepared
@@ -90,8 +94,7 @@ def _put_again(scene: Scene, sizes: Sizes, state: State, given: Any) -> tuple[St
     if e.mixed is not None:  # the result does not contain the pressures of volumetric = 'mixed'
         pressure = e.mixed.settled(mesh, determinant(F))
     P = _whole_stress(e, F, pressure)
-    law = law_at_rest(scene)
-    energy = law.strain_energy(law.measures(F))
+    energy = _energy(scene, e, F, pressure)
     vertices = None if pressure is None else pressure[: mesh.number_of_vertices]
     velocity = (
         jnp.zeros((3, *determinant(F).shape))
@@ -100,6 +103,16 @@ def _put_again(scene: Scene, sizes: Sizes, state: State, given: Any) -> tuple[St
     )
     at = (pack(P), pack(F), jnp.broadcast_to(energy, determinant(F).shape), velocity)
     return advanced(e, End(x, F, vertices)), at
+
+
+def _energy(scene: Scene, e: Equations, F: Matrix, pressure: jax.Array) -> Number:
+    """Return the energy density [J/m^3] of the law. The volumetric energy is that of the run: with averaged or mixed
+    volumes, the volume ratio of a single element may be far from the volume ratio that causes the pressure."""
+    law = law_at_rest(scene)
+    if not isinstance(e.volume, Averaged | Mixed):
+        return law.strain_energy(law.measures(F))
+    shape = isochoric_part(law)
+    return shape.strain_energy(shape.measures(F)) + e.volume.density(e.mesh, pressure, determinant(F))
 
 
 def _whole_stress(e: Equations, F: Matrix, pressure: jax.Array) -> Matrix:

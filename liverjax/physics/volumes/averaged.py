@@ -116,6 +116,11 @@ class Averaged(VolumeStress):
         """Return the volumetric energy [J] from the function `energy` of this module."""
         return energy(mesh, self.law, J)
 
+    def density(self, mesh: TetMesh, pressure: jax.Array, J: jax.Array) -> jax.Array:
+        """Return the volumetric energy density (E,) [J/m^3]: the means of the densities at the corners."""
+        U = volumetric_part(self.law)
+        return interpolated(mesh, U.strain_energy(_invariants(U, _mean(mesh, J)[0])))
+
     def matrix(self, mesh: TetMesh, J: jax.Array, positive: bool) -> BlockMatrix:
         """Return the pressure matrix [m^3/Pa] from the function `compliance`."""
         return compliance(mesh, self.law, J, positive)

@@ -167,6 +167,11 @@ class Mixed(VolumeStress):
             self.settled(mesh, J), integrals(mesh, g)
         )
 
+    def density(self, mesh: TetMesh, pressure: jax.Array, J: jax.Array) -> jax.Array:
+        """Return the volumetric energy density [J/m^3], gamma g^2/2 + p g/2, at pressures p (V,) of `settled`."""
+        g = strain(self.kind, J)
+        return 0.5 * g * (self.part * g + interpolated(mesh, pressure))
+
     def scalars(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Scalars:
         """Return the first and second derivative of the energy density with respect to J, at given pressures (V,)."""
         g, g1, g2 = self._slopes(determinant(F))
