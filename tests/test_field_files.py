@@ -142,7 +142,8 @@ def test_the_progress_of_an_earlier_map_does_not_stay(tmp_path, monkeypatch, cap
     _scene(tmp_path)
     out = tmp_path / "out"
     (tmp_path / "u.csv").write_text("node,ux,uy,uz\n5,1e-3,0,0\n6,1e-3,0,1e-4")
-    monkeypatch.setattr(scene_numbers, "with_discretisation_as_noise", stopped)
+    monkeypatch.setattr(scene_numbers, "with_discretisation_as_noise", lambda problem: (problem, [{}]))
+    monkeypatch.setattr(field, "estimate", stopped)
     command = ["field", str(tmp_path / "scene.toml"), str(tmp_path / "u.csv"), "--noise", "5e-5", "--out", str(out)]
     out.mkdir()
     (out / "progress.h5").write_text("another map")
