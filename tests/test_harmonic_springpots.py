@@ -8,6 +8,7 @@ from test_harmonic import FILE, FREQUENCIES, MU, PRONY, slab, standing, stretche
 
 import liverjax as lj
 from liverjax.core.struct import replace
+from liverjax.scenes.springpots import check_springpots, springpot_factors
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -139,3 +140,20 @@ def test_springpots_that_cannot_be_are_refused(tmp_path, old, new, words):
     (tmp_path / "scene.toml").write_text(text.replace(old, new))
     with pytest.raises(lj.InputError, match=words):
         lj.load_scene(tmp_path / "scene.toml")
+
+
+@pytest.mark.parametrize("kind", [list, tuple])
+def test_springpots_are_lists_tuples_or_arrays(kind):
+    """Lists of exponents or limits ended in a TypeError. Only a list of times was converted to an array."""
+    rows = {"times": [0.0125, 0.002], "exponents": [0.2, 0.6], "limits": [1e9, 4.0]}
+    exact = lj.SpringpotSeries(**{key: jnp.array(row) for key, row in rows.items()}, spring=0.3)
+    own = lj.SpringpotSeries(**{key: kind(row) for key, row in rows.items()}, spring=0.3)
+    law, omegas = lj.laws.NeoHookean(mu=770.0, bulk=7700.0), jnp.array([1.0, 30.0])
+
+    def factors(series):
+        check_springpots(series, law, None)
+        return springpot_factors(series, omegas)
+
+    np.testing.assert_array_equal(factors(own), factors(exact))
+    changed = jax.eval_shape(lambda row: factors(replace(own, exponents=kind(row))), rows["exponents"])
+    assert changed.shape == (2,)

@@ -98,6 +98,14 @@ CALLS = {
         held(lj.Obstacle(triangles=FACES, axis=jnp.array([0, 0, -1.0]), position=(0, 0, 0.03))),
         {"obstacle.0.axis": jnp.array([[0, 0, -1.0], [0, 0, -2.0]])},
     ),
+    "body.gravity has shape \\(\\): give 3 numbers, or name one .* body.gravity.2": lambda: lj.value_and_gradient(
+        lambda result: jnp.sum(result.positions), scene(body=lj.Body(density=1e3)), {"body.gravity": -9.81}
+    ),
+    # Gravity is 0, but inside jit the function cannot know this.
+    "body.gravity is unknown inside jit, .* or give porosity.drained": lambda: jax.eval_shape(
+        lambda own: lj.harmonic(own, [5.0]).displacement,
+        scene(porosity=SPONGE, body=lj.Body(density=1e3, gravity=(0.0, 0.0, 0.0))),
+    ),
 }
 
 
@@ -129,3 +137,27 @@ def test_masks_and_lists_are_taken_as_their_numbers():
     own = scene(fixed=(lj.Fixed(nodes=np.flatnonzero(mask).tolist()),), traction=(load,))
     exact = lj.simulate(scene(traction=(replace(load, value=jnp.array([0.0, 0.0, 50.0])),))).check().positions
     np.testing.assert_array_equal(jax.jit(lj.simulate)(own).positions, exact)
+
+
+def test_tuples_are_histories_as_lists_are():
+    """Times and histories in tuples passed the checks, and then the run ended with a TypeError."""
+    rows = {"times": (0.0, 1.0), "history": (0.0, 1.0)}
+    path = ((0.0, 0.0, 0.0), (0.0, 0.0, -1e-3))
+    inlet = Inlet(nodes=tuple(TOP.tolist()), pressure=1.0, **rows)
+    own = scene(
+        body=lj.Body(density=1e3, gravity=(0.0, 0.0, -1.0), **rows),
+        traction=(lj.Traction(triangles=FACES, value=(0.0, 0.0, 5.0), **rows),),
+        displaced=(lj.Displaced(nodes=(int(TOP[0]),), times=(0.0, 1.0), history=path),),
+        porosity=replace(SPONGE, inlet=(inlet,)),
+        physics=(lj.Obstacle(triangles=FACES, axis=(0.0, 0.0, -1.0), position=(0.0, 0.0, 0.03), by=path[1], **rows),),
+        solve=lj.Solve(dt=0.1, steps=1),
+    )
+    check_before_run(own)
+    values = {
+        "traction.0.times": jnp.array([0.0, 2.0]),
+        "body.times.1": 2.0,
+        "displaced.0.history.1.2": -2e-3,
+        "porosity.inlet.0.history.1": 0.5,
+        "obstacle.0.history": jnp.array([0.0, 0.5]),
+    }
+    jax.eval_shape(lambda at: lj.simulate(lj.with_parameters(own, at)).positions, values)

@@ -339,3 +339,12 @@ def test_two_planes_given_by_normals_share_no_node(run):
         return normal
 
     jax.eval_shape(passed, slides[0].normal)
+
+
+def test_a_normal_in_a_tuple_can_be_unknown():
+    """The checks gave a tuple of JAX tracers to NumPy, so the derivative ended with a traceback."""
+    mesh = box()
+    slide = SlidingSupport(nodes=jnp.asarray(part(mesh, z_max=0.0)), normal=(0.0, 0.0, 1.0))
+    scene = pulled(mesh, [0.0, 0.0, 10.0], physics=(slide,))
+    for values in ({"support.0.normal": slide.normal}, {"support.0.normal.0": 0.0}):
+        jax.eval_shape(lambda at: lj.simulate(lj.with_parameters(scene, at)).positions, values)

@@ -191,3 +191,11 @@ def test_a_region_changes_a_viscosity_with_values_per_element(keys):
     wrong = lj.Region(elements=half, viscosity={"ratios": jnp.array([0.6, 0.5])})
     with pytest.raises(lj.InputError, match=r"region\.0: viscosity\.ratios = .* must add up to less than 1"):
         check_region_viscosity(scene.viscosity, wrong, "region.0")
+
+
+@pytest.mark.parametrize("name", ["viscosity.ratios.0", "region.0.viscosity.ratios.0"])
+def test_ratios_in_tuples_can_be_unknown(name):
+    """The check of regions gave a tuple of JAX tracers to NumPy, so the derivative ended with a traceback."""
+    region = lj.Region(elements=jnp.arange(4), viscosity={"ratios": (0.1, 0.5)})
+    scene = block(viscosity={"ratios": (0.3, 0.2), "relaxation_times": (0.3, 0.03)}, region=(region,))
+    jax.eval_shape(lambda value: lj.simulate(lj.with_parameters(scene, {name: value})).positions, 0.25)

@@ -154,9 +154,15 @@ def check_shape(where: str, value: Any, *allowed: tuple[int, ...]) -> None:
     Raises:
         InputError: the array has a shape that is not in `allowed`.
     """
-    if value is not None and np.shape(value) not in allowed:
+    if value is not None and shape_of(value) not in allowed:
         words = " or ".join("one number" if shape == () else f"shape {shape}" for shape in allowed)
-        raise InputError(f"{where} has shape {np.shape(value)}: give {words}")
+        raise InputError(f"{where} has shape {shape_of(value)}: give {words}")
+
+
+def shape_of(value: Any) -> tuple[int, ...]:
+    """Return the shape of a value. NumPy cannot determine the shape of a sequence of numbers inside jit."""
+    rows = {shape_of(row) for row in value} if isinstance(value, tuple | list) else set()
+    return (len(value), *rows.pop()) if len(rows) == 1 else np.shape(value)
 
 
 def finite(value: float) -> bool:

@@ -99,9 +99,10 @@ def struct(cls: type[T]) -> type[T]:
     """Make `cls` a frozen, keyword-only dataclass that is registered as a pytree. `static` fields are not leaves."""
     made: Any = dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)
     fields = dataclasses.fields(made)
-    if any(f.name in _WHOLE | _FLOATING for f in fields):
-        made.__init__ = _with_arrays(made.__init__)
     several = frozenset(f.name for f in fields if f.metadata.get("each"))
+    arrays = {f.name for f in fields} & (_WHOLE | _FLOATING) - several
+    if arrays:
+        made.__init__ = _with_arrays(made.__init__, arrays)
     if several:
         made.__init__ = _with_tuples(made.__init__, several)
     meta = tuple(f.name for f in fields if f.metadata.get("static"))
@@ -128,14 +129,21 @@ def struct(cls: type[T]) -> type[T]:
     return made
 
 
-#: Names of fields with arrays of whole numbers, and with arrays of floating-point numbers. A user may also give a list.
-_WHOLE, _FLOATING = frozenset(("nodes", "triangles", "elements", "drained")), frozenset(("times", "history"))
+#: Names of fields with arrays of whole numbers. A user may also give a list or a tuple.
+_WHOLE = frozenset(("nodes", "triangles", "elements", "drained"))
+#: Names of fields with arrays of floating-point numbers. A user may also give a list or a tuple.
+_FLOATING = frozenset(("times", "history", "exponents", "limits"))
 
 
-def _with_arrays(make: Callable[..., None]) -> Callable[..., None]:
-    """Return the method `make` (__init__ of a struct), changed such that it first converts lists to arrays."""
+def _with_arrays(make: Callable[..., None], arrays: set[str]) -> Callable[..., None]:
+    """Return the method `make` (__init__ of a struct), changed such that it first converts lists and tuples to arrays.
 
-    def converted(name: str, value: list) -> Array:
+    Args:
+        make: the method.
+        arrays: names of the fields that are arrays.
+    """
+
+    def converted(name: str, value: list | tuple) -> Array:
         try:
             if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(value)):
                 return jnp.asarray(value)
@@ -145,7 +153,7 @@ def _with_arrays(make: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(make)
     def init(self: object, **given: object) -> None:
-        lists = {k: v for k, v in given.items() if k in _WHOLE | _FLOATING and isinstance(v, list)}
+        lists = {k: v for k, v in given.items() if k in arrays and isinstance(v, list | tuple)}
         make(self, **given | {name: converted(name, value) for name, value in lists.items()})
 
     return init

@@ -156,7 +156,7 @@ def with_parameters(scene: Scene, values: Mapping[str, Any]) -> Scene:
             ``mesh.points``, ``region.0.law.mu``. A parameter of a law may have one value per element (E,).
 
     Raises:
-        InputError: the scene has no number with one of these names.
+        InputError: the scene has no number with one of these names, or one number is given instead of several.
     """
     for name, value in values.items():
         if name == "mesh.points":
@@ -167,6 +167,10 @@ def with_parameters(scene: Scene, values: Mapping[str, Any]) -> Scene:
                 f"{_refusal(name)}; a mesh can be changed only through all its positions together: use mesh.points"
             )
         old = names.get(scene, name, _refusal(name))
+        if isinstance(old, tuple) and not isinstance(value, tuple | list) and np.ndim(value) == 0:
+            raise InputError(
+                f"{name} has shape (): give {len(old)} numbers, or name one of them, for example {name}.{len(old) - 1}"
+            )
         like = (
             tuple(value) if isinstance(old, tuple) else jnp.array(value, float) if isinstance(old, jax.Array) else value
         )

@@ -97,7 +97,7 @@ def harmonic(
             `simulate`. The stress in this state changes the stiffness; the fluid pressure is 0. Default: the state of
             rest under gravity and pre-tension, from a static run. In a scene without gravity and pre-tension, this run
             is not done and the reference shape is used. If the components of gravity are JAX tracers (inside jit, grad
-            or vmap), the run is always done.
+            or vmap), the run is always done, so a porous body must then be able to drain.
         motion: complex amplitudes (V, 3) or (F, V, 3) [m] that replace the prescribed motion of the scene.
         mass: "consistent" (mass matrix of each element), or "lumped". `[body] mass` has no effect.
 
@@ -113,7 +113,7 @@ def harmonic(
     if scene.springpots is not None:
         factors = relative_moduli(scene, omegas) if factors is None else factors
     scene = _small(scene, mass)
-    about = under_its_weight(weighed) if about is None else about
+    about = _at_rest(weighed) if about is None else about
     mesh = scene.mesh
     number, elements = len(omegas), mesh.number_of_elements
     factors = relative_moduli(scene, omegas) if factors is None else jnp.asarray(factors, complex)
@@ -129,6 +129,24 @@ def harmonic(
     _check_about(scene, about)
     motion = jnp.broadcast_to(motion, (number, *mesh.points.shape))
     return _answer(scene, (factors, omegas), motion, about, mass)
+
+
+def _at_rest(scene: Scene) -> jax.Array | None:
+    """Return the positions of `under_its_weight`.
+
+    Raises:
+        InputError: gravity is unknown (inside jit, grad or vmap), and a porous body cannot drain; or there is no state
+            of rest.
+    """
+    gravity = [] if scene.body is None else jax.tree.leaves(scene.body.gravity)
+    closed = scene.porosity is not None and not _drains(scene.porosity)
+    if closed and any(isinstance(leaf, jax.core.Tracer) for leaf in gravity):
+        raise InputError(
+            "body.gravity is unknown inside jit, grad or vmap, so it counts as a load, which does not determine the "
+            "pressure in a porous body that cannot drain: do not make body.gravity an argument of the transformed "
+            "function, or give porosity.drained"
+        )
+    return under_its_weight(scene)
 
 
 def _amplitudes_of_motion(scene: Scene) -> jax.Array:

@@ -70,7 +70,7 @@ def check_normals(scene: Scene) -> None:
     if all(slide.axis for _, slide in slides) or any(isinstance(n, jax.core.Tracer) for n in nodes):
         return
     for name, slide in slides:
-        if not isinstance(slide.normal, jax.core.Tracer):
+        if not _is_unknown(slide.normal):
             slide.check(scene.mesh, name)
     taken: dict[int, str] = {}
     mask = free_places(scene.mesh, scene.fixed, scene.displaced)
@@ -78,7 +78,7 @@ def check_normals(scene: Scene) -> None:
         if physics.axis:
             mask[np.asarray(physics.nodes), AXES.index(physics.axis)] = False
     for name, physics in slides:
-        if physics.axis or isinstance(physics.normal, jax.core.Tracer):
+        if physics.axis or _is_unknown(physics.normal):
             continue
         across = np.abs(np.asarray(physics.normal)) > 1e-12
         for node in np.asarray(physics.nodes).tolist():
@@ -93,6 +93,11 @@ def check_normals(scene: Scene) -> None:
                     f"{name} and another condition constrain node {node} in directions that are not at right angles: "
                     "select different nodes"
                 )
+
+
+def _is_unknown(value: object) -> bool:
+    """Return whether a number, or a number in a tuple or list, is unknown (inside jit, grad or vmap)."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(value))
 
 
 def check_prescribed_once(scene: Scene) -> None:

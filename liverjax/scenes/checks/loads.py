@@ -1,11 +1,9 @@
 """Check that all loads, weight, motions and supports are given once and in the right shape. Values are not checked."""
 
-from typing import Any
-
 import jax
 import numpy as np
 
-from liverjax.core import history
+from liverjax.core import bounds, history
 from liverjax.core.errors import InputError
 from liverjax.physics.loads import Traction
 from liverjax.physics.porosity import check_inlets
@@ -43,22 +41,15 @@ def _check_traction(load: Traction, name: str) -> None:
     if (load.value is None) == (load.pressure is None):
         raise InputError(f"{name} needs either value (3,) or pressure, in Pa: give one of them")
     key, shape = ("pressure", ()) if load.value is None else ("value", (3,))
-    if _shape(getattr(load, key)) != shape:
+    if bounds.shape_of(getattr(load, key)) != shape:
         wanted = f"shape {shape}" if shape else "one number"
-        raise InputError(f"{name} {key} has shape {_shape(getattr(load, key))}: give {wanted}")
-
-
-def _shape(value: Any) -> tuple[int, ...]:
-    """Return the shape of a value. NumPy cannot determine the shape of a sequence of numbers inside jit."""
-    if isinstance(value, tuple | list) and all(np.ndim(one) == 0 for one in value):
-        return (len(value),)
-    return np.shape(value)
+        raise InputError(f"{name} {key} has shape {bounds.shape_of(getattr(load, key))}: give {wanted}")
 
 
 def _check_motion(motion: Displaced, name: str) -> None:
     history.check_times(motion.times, motion.history, name, (3,) if motion.by is None else (1,))
     check_axes(motion.axes, name)
-    by, shape = motion.by, _shape(motion.by)
+    by, shape = motion.by, bounds.shape_of(motion.by)
     if by is not None and shape not in ((3,), (*np.shape(motion.nodes), 3)):
         raise InputError(f"{name} 'by' has shape {shape}: give three numbers in m, or three per node")
     if motion.by is None and motion.history is None:
@@ -68,7 +59,7 @@ def _check_motion(motion: Displaced, name: str) -> None:
 def _check_body(body: Body, nodes: int) -> None:
     if body.mass not in MASSES:
         raise InputError(f"[body] mass = {body.mass!r} is not known: use {' or '.join(MASSES)}")
-    gravity = _shape(body.gravity)
+    gravity = bounds.shape_of(body.gravity)
     density = np.shape(body.density)
     if density not in ((), (nodes,)):
         raise InputError(f"[body] density has shape {density}: give one number or one per node ({nodes},), in kg/m^3")

@@ -1,5 +1,7 @@
 """Checks of the regions of a scene. One function checks their parameters, another one checks their elements."""
 
+import math
+
 import jax
 import numpy as np
 
@@ -128,14 +130,14 @@ def check_region_viscosity(prony: Prony | None, region: Region, name: str) -> No
         raise InputError(
             f"{name}: viscosity contains {unknown[0]}, but only {' and '.join(VISCOUS)} can differ in a region"
         )
-    modes = np.shape(prony.ratios)[0]
+    modes = bounds.shape_of(prony.ratios)[0]
     for key, value in own.items():
-        if np.shape(value) != (modes,):
-            n = np.size(value)
+        if bounds.shape_of(value) != (modes,):
+            n = math.prod(bounds.shape_of(value))
             raise InputError(
                 f"{name}: viscosity.{key} has {n} numbers, but the scene has {modes} modes; give {modes} numbers"
             )
-    if any(isinstance(value, jax.core.Tracer) for value in (*own.values(), prony.ratios)):
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((dict(own), prony.ratios))):
         return
     changed: Content = {key: np.asarray(value, float) for key, value in own.items()}
     if np.ndim(prony.ratios) == 2:  # the scene has one series per element
