@@ -14,6 +14,8 @@ from liverjax.__main__ import main
 from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
+from liverjax.physics.elastic_support import ElasticSupport
+from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.scenes.scene_file import scene_from
 from liverjax.simulation.unloaded import cautions_of_loaded, unload
 
@@ -189,6 +191,38 @@ def test_derivatives_of_the_reference_shape():
     by = jax.grad(length)(800.0)
     errors = [abs((length(800.0 + h) - length(800.0 - h)) / (2 * h) / by - 1) for h in (80.0, 0.8, 8e-7)]
     assert errors[1] < 1e-5 and errors[0] > 1e-4 and errors[2] > errors[1]
+
+
+@pytest.mark.slow
+def test_derivative_with_respect_to_the_direction_of_a_sliding_plane():
+    """The derivative of the reference points along the normal of the plane was 0 at the sliding nodes."""
+    mesh = lj.shapes.box((0.1, 0.1, 0.1), (1, 1, 1))
+    left, right = (lj.boundary.boundary_triangles(mesh, mesh.node_sets[name]) for name in ("x_min", "x_max"))
+    low = mesh.node_sets["z_min"]
+    scene = lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=1000.0, bulk=3000.0),
+        physics=(
+            ElasticSupport(triangles=left, normal=3000.0),
+            SlidingSupport(nodes=low, normal=jnp.array([0, 0, 1.0])),
+        ),
+        traction=(lj.Traction(triangles=right, value=jnp.array([60.0, 0, 0])),),
+        solve=lj.Solve(tolerance=TOLERANCE),
+        fixed=(lj.Fixed(nodes=mesh.node_sets["x_min"], axes="y"),),
+        points_are="loaded",
+    )
+
+    def points(angle):
+        normal = jnp.stack([jnp.sin(angle), 0.0 * angle, jnp.cos(angle)])
+        return lj.unloaded(lj.with_parameters(scene, {"support.1.normal": normal})).scene.mesh.points
+
+    # One program for points and derivatives: a second program would have to be compiled, too.
+    both = jax.jit(lambda angle: jax.jvp(points, (angle,), (1.0,)))
+    h = 1e-4
+    (less, _), (_, by), (more, _) = (both(angle) for angle in (-h, 0.0, h))
+    expected = np.asarray(more - less) / (2 * h)
+    assert np.abs(expected[np.asarray(low), 2]).min() > 0.01  # [m]
+    np.testing.assert_allclose(by, expected, atol=1e-6)
 
 
 @pytest.mark.slow

@@ -113,7 +113,8 @@ def _found_shape(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array]:
 
     options = _OPTIONS._replace(tolerance=jax.lax.stop_gradient(scene.solve.tolerance))
     z, found = newton_root(held, jnp.zeros_like(q), tangent.preconditioner(first, K), loads, options)
-    u = _displacements_in(first, z)
+    # `first` is constant. The free directions depend on the normal of a sliding support, so they are computed again.
+    u = _displacements_in(equations(scene, initial_state(scene), one, sizes), z)
     mesh = with_points(scene.mesh, given - u)
     # Loaded quadratic elements have curved edges, so their middles are not those of the given mesh.
     good = jnp.all(volume_ratios(mesh, mesh.points + u) > 0) & jnp.all(mesh.volumes > 0)

@@ -26,6 +26,7 @@ from liverjax.simulation.run import prepared
 from liverjax.solvers.factors.memory import free_memory
 from liverjax.waves import sparse
 from liverjax.waves.operator import Operator, free_part, operator
+from liverjax.waves.pressures import AtRest
 from liverjax.waves.rest import under_its_weight, without_history
 
 MASSES = ("consistent", "lumped")
@@ -75,7 +76,7 @@ def harmonic(
     scene: Scene,
     frequencies_Hz: Numbers | None = None,
     factors: Number | None = None,
-    about: jax.Array | None = None,
+    about: jax.Array | AtRest | None = None,
     motion: Number | None = None,
     mass: str = "consistent",
 ) -> Harmonic:
@@ -97,7 +98,8 @@ def harmonic(
             `simulate`. The stress in this state changes the stiffness; the fluid pressure is 0. Default: the state of
             rest under gravity and pre-tension, from a static run. In a scene without gravity and pre-tension, this run
             is not done and the reference shape is used. If the components of gravity are JAX tracers (inside jit, grad
-            or vmap), the run is always done, so a porous body must then be able to drain.
+            or vmap), the run is always done, so a porous body must then be able to drain. `AtRest` also contains the
+            stress of mixed elements.
         motion: complex amplitudes (V, 3) or (F, V, 3) [m] that replace the prescribed motion of the scene.
         mass: "consistent" (mass matrix of each element), or "lumped". `[body] mass` has no effect.
 
@@ -157,7 +159,7 @@ def _amplitudes_of_motion(scene: Scene) -> jax.Array:
     return prescribed(scene.mesh, tuple(replace(d, times=None, history=None) for d in scene.displaced), 0.0, 1.0)
 
 
-def _check_about(scene: Scene, about: jax.Array | None) -> None:
+def _check_about(scene: Scene, about: jax.Array | AtRest | None) -> None:
     """Raise InputError if the positions `about` have a wrong shape, or do not determine the pressure of a fluid."""
     if about is None:
         return
@@ -166,10 +168,9 @@ def _check_about(scene: Scene, about: jax.Array | None) -> None:
             "a loaded state (gravity, about) does not determine the pressure in a porous body that cannot drain: give "
             "porosity.drained"
         )
-    if jnp.shape(about) != scene.mesh.points.shape:
-        raise InputError(
-            f"the argument 'about' has shape {jnp.shape(about)}: give positions of shape {scene.mesh.points.shape}"
-        )
+    shape = jnp.shape(about.positions if isinstance(about, AtRest) else about)
+    if shape != scene.mesh.points.shape:
+        raise InputError(f"the argument 'about' has shape {shape}: give positions of shape {scene.mesh.points.shape}")
 
 
 def element_operator(scene: Scene, about: jax.Array | None = None, mass: str = "consistent") -> Operator:
@@ -183,7 +184,7 @@ def element_operator(scene: Scene, about: jax.Array | None = None, mass: str = "
     return _operator(small, under_its_weight(scene) if about is None else about, mass)
 
 
-def _operator(scene: Scene, about: jax.Array | None, mass: str) -> Operator:
+def _operator(scene: Scene, about: jax.Array | AtRest | None, mass: str) -> Operator:
     solve = replace(scene.solve, volumetric="element")
     unmoved = tuple(replace(d, by=jnp.zeros(3), times=None, history=None) for d in scene.displaced)
     still = replace(scene, viscosity=None, porosity=None, displaced=unmoved, solve=solve)
@@ -191,7 +192,10 @@ def _operator(scene: Scene, about: jax.Array | None, mass: str) -> Operator:
     e = equations(still, initial_state(still), 1.0, Sizes(none, none))
     if e.free.tied:
         raise InputError("a rigid plate cannot be used in harmonic motion: prescribe the motion of its nodes")
-    return operator(e._replace(scene=scene), scene.mesh.points if about is None else about, about is not None, mass)
+    e = e._replace(scene=scene)
+    if isinstance(about, AtRest):
+        return operator(e, about.positions, True, mass, about.stress)
+    return operator(e, scene.mesh.points if about is None else about, about is not None, mass)
 
 
 @partial(jax.jit, static_argnames="mass")

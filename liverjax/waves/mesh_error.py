@@ -10,12 +10,14 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import Number, param, replace, struct
 from liverjax.mesh.promotion import on_middles
 from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.scenes.by_element import by_element
 from liverjax.scenes.enriched import enriched
 from liverjax.scenes.refined import REFINED, Within, can_be_refined, on_refined_mesh
 from liverjax.scenes.scene import Scene
 from liverjax.simulation.automatic import form_of_volumes
 from liverjax.solvers.point_matrix import restricted
 from liverjax.waves.harmonic import Harmonic, harmonic
+from liverjax.waves.pressures import AtRest, mixed_at_rest
 from liverjax.waves.rest import under_its_weight
 
 
@@ -78,11 +80,11 @@ def harmonic_errors(
     rich, within = on_refined_mesh(scene) if finer else (_richer_elements(scene), None)
     of_all_nodes = partial(_padded, rich.mesh, within)
     motion = None if motion is None else of_all_nodes(jnp.asarray(motion, complex))
-    about = None if about is None else of_all_nodes(jnp.asarray(about))
+    state = None if about is None else _with_own_stress(scene, jnp.asarray(about), of_all_nodes(jnp.asarray(about)))
     if within is not None and factors is not None and jnp.ndim(factors) == 2:
         factors = jnp.repeat(jnp.asarray(factors), 8, axis=1)  # for the eight parts of every element
     try:
-        more = harmonic(rich, found.frequencies_Hz, factors, about, motion)
+        more = harmonic(rich, found.frequencies_Hz, factors, state, motion)
     except InputError as e:
         raise InputError(f"the mesh error cannot be estimated with richer elements: {e}") from None
     force = _on_nodes(scene.mesh, rich.mesh, within, more.reactions)
@@ -108,6 +110,18 @@ def _richer_elements(scene: Scene) -> Scene:
         # "auto" chooses "mixed" if the laws allow it, otherwise "element".
         return replace(rich, solve=replace(rich.solve, volumetric="auto"))
     return rich
+
+
+def _with_own_stress(scene: Scene, about: jax.Array, of_all_nodes: jax.Array) -> jax.Array | AtRest:
+    """Return the state of rest of the richer elements: positions of all their nodes, and the stress of the given
+    elements.
+
+    At the same positions, the pressures of mixed quadratic elements would not be those of mixed linear elements, which
+    have a stabilisation term.
+    """
+    if scene.mesh.order > 1 or scene.porosity is not None or form_of_volumes(scene) != "mixed":
+        return of_all_nodes
+    return AtRest(of_all_nodes, mixed_at_rest(by_element(scene), about))
 
 
 def _on_nodes(mesh: TetMesh, rich: TetMesh, within: Within | None, forces: jax.Array) -> jax.Array:

@@ -54,7 +54,7 @@ class Operator(NamedTuple):
     pressures: Pressures | None = None
 
 
-def operator(e: Equations, x: jax.Array, loaded: bool, mass: str) -> Operator:
+def operator(e: Equations, x: jax.Array, loaded: bool, mass: str, stress: jax.Array | None = None) -> Operator:
     """Return the dynamic stiffness for small motion about positions x (V, 3) [m].
 
     Args:
@@ -62,9 +62,10 @@ def operator(e: Equations, x: jax.Array, loaded: bool, mass: str) -> Operator:
         x: positions (V, 3) [m].
         loaded: whether x differs from the reference shape. Then the stress at x changes the stiffness.
         mass: "consistent", or "lumped".
+        stress: volumetric stress at the vertices (`liverjax.waves.pressures.AtRest`); None: it follows from x.
     """
     scene, mesh, F = e.scene, e.mesh, deformation_gradient(e.mesh, x)
-    volume, pressures = scalars_and_pressures(scene, x, F)
+    volume, pressures = scalars_and_pressures(scene, x, F, stress)
     relaxing, rest = _blocks(scene, law_beside(scene), F, loaded)
     if volume is not None:
         own = invariant_terms.blocks(invariant_terms.state_of(volume, F), _shape_vectors(mesh), _OWN)

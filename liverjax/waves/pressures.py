@@ -31,9 +31,9 @@ from liverjax.physics.base import Free, Step
 from liverjax.physics.darcy import LEAST_J, unknown_pressures
 from liverjax.physics.porosity import Porosity, inflow, law_in_force, volumetric_slope, volumetric_stress
 from liverjax.physics.volumes.averaged import Averaged, nodal_energy
-from liverjax.physics.volumes.mixed import Mixed, MixedVolume
+from liverjax.physics.volumes.mixed import Mixed, MixedVolume, strain
 from liverjax.scenes.scene import Scene
-from liverjax.tensors.matrices import Matrix, determinant, dot, scale
+from liverjax.tensors.matrices import Matrix, deformation_gradient, determinant, dot, scale
 
 
 class Pressures(NamedTuple):
@@ -48,6 +48,23 @@ class Pressures(NamedTuple):
     enters: jax.Array | None  # (P,) [m^3/s] amplitude of the inflow; None without inflow
 
 
+class AtRest(NamedTuple):
+    """Positions at rest with the volumetric stress of mixed elements.
+
+    Linear elements have a stabilisation term, so other elements do not have this stress at the same positions.
+    """
+
+    positions: jax.Array  # (V, 3) [m]
+    stress: jax.Array  # (P,) [Pa] derivative of the energy with respect to the volumetric strain, at the vertices
+
+
+def mixed_at_rest(scene: Scene, x: jax.Array) -> jax.Array:
+    """Return the volumetric stress `AtRest.stress` of a scene without regions at positions x (V, 3) [m]."""
+    J = determinant(deformation_gradient(scene.mesh, x))
+    volume = _mixed_volume(scene, x, J)
+    return volume.settled(scene.mesh, J) + _beside_pressures(scene.mesh, volume, J)
+
+
 def law_beside(scene: Scene) -> Any:
     """Return the law without its volumetric energy if unknown pressures or the porous body replace this energy;
     otherwise return the law."""
@@ -56,11 +73,14 @@ def law_beside(scene: Scene) -> Any:
     return law_in_force(scene.porosity, scene.law)
 
 
-def scalars_and_pressures(scene: Scene, x: jax.Array, F: Matrix) -> tuple[Scalars | None, Pressures | None]:
+def scalars_and_pressures(
+    scene: Scene, x: jax.Array, F: Matrix, stress: jax.Array | None
+) -> tuple[Scalars | None, Pressures | None]:
     """Return the volumetric stress and its derivative with respect to the volume ratio J at given pressures, and
     `Pressures`.
 
-    Both are computed at positions x (V, 3) [m]. Both are None if the scene has no unknown pressures.
+    Both are computed at positions x (V, 3) [m], with the volumetric stress `AtRest.stress` if it is given. Both are
+    None if the scene has no unknown pressures.
     """
     mesh, J = scene.mesh, determinant(F)
     if scene.porosity is not None:
@@ -69,7 +89,7 @@ def scalars_and_pressures(scene: Scene, x: jax.Array, F: Matrix) -> tuple[Scalar
         found = Scalars({"J": volumetric_stress(own, J)}, {("J", "J"): volumetric_slope(own, J)})
         return found, _of_sponge(own, mesh, F)
     if scene.solve.volumetric == "mixed":
-        return _of_mixed(scene, x, F)
+        return _of_mixed(scene, x, F, stress)
     if scene.solve.volumetric == "nodal":
         return _of_averaged(scene, F)
     return None, None
@@ -87,14 +107,25 @@ def _of_sponge(porosity: Porosity, mesh: TetMesh, F: Matrix) -> Pressures:
     return Pressures(mesh.tetrahedra.T, pulled, store, flow, mask, pressures, enters if flux else None)
 
 
-def _of_mixed(scene: Scene, x: jax.Array, F: Matrix) -> tuple[Scalars, Pressures]:
+def _of_mixed(scene: Scene, x: jax.Array, F: Matrix, stress: jax.Array | None) -> tuple[Scalars, Pressures]:
     mesh, J = scene.mesh, determinant(F)
-    none = jnp.zeros(mesh.number_of_vertices, J.dtype)
-    volume = MixedVolume(law=scene.law).freeze(none, Step(mesh, x, 1, 1, None, False, None, Free(jnp.ones_like(x))))
+    volume = _mixed_volume(scene, x, J)
+    pressure = volume.settled(mesh, J) if stress is None else stress - _beside_pressures(mesh, volume, J)
     border = volume.border(J)
     store = _compliance(mesh, volume)
     pull = _pull(mesh, [scale(border, g) for g in volume_gradients(mesh, F)])
-    return volume.scalars(mesh, volume.settled(mesh, J), F), _sealed(mesh, pull, store)
+    return volume.scalars(mesh, pressure, F), _sealed(mesh, pull, store)
+
+
+def _mixed_volume(scene: Scene, x: jax.Array, J: jax.Array) -> Mixed:
+    none = jnp.zeros(scene.mesh.number_of_vertices, J.dtype)
+    step = Step(scene.mesh, x, 1, 1, None, False, None, Free(jnp.ones_like(x)))
+    return MixedVolume(law=scene.law).freeze(none, step)
+
+
+def _beside_pressures(mesh: TetMesh, volume: Mixed, J: jax.Array) -> jax.Array:
+    """Return the means (P,) [Pa], around the vertices, of the volumetric stress that is not in the pressures."""
+    return integrals(mesh, jnp.asarray(volume.part) * strain(volume.kind, J)) / integrals(mesh, jnp.ones_like(J))
 
 
 def _compliance(mesh: TetMesh, volume: Mixed) -> jax.Array:
