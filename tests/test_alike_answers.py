@@ -205,7 +205,7 @@ def test_noise_of_constant_size_sets_the_weights_beside_a_sweep():
     assert both.tests[1].constant_noise and both.shares[1].noise < 0.05
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_errors_contain_the_error_of_a_subtracted_offset(tmp_path):
     """Four rows at rest determine the offset of the sensor. Without its error, the equilibrium modulus scattered by 3.5
     standard errors, and a quarter of the intervals contained the truth.

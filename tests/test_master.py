@@ -86,7 +86,7 @@ def test_standard_errors_of_factors_are_right_if_the_noise_of_the_moduli_differs
     assert np.median(of_the_better) < 0.02  # decades; 0.05 with equal weights
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_errors_of_factors_contain_the_noise_where_points_scatter():
     """A curve with knots 0.4 decades apart follows the noise. Then the errors were only a half to a fifth of the right
     size.

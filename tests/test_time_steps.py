@@ -49,7 +49,7 @@ WAVE = {"kind": "dynamic", "rise": 0.02}
         pytest.param(0.1, {"rise": None}, 1, marks=pytest.mark.slow),
         pytest.param(0.1, {"scheme": "backward_euler"}, 1, marks=pytest.mark.slow),
         pytest.param(0.002, WAVE, 1, marks=pytest.mark.slow),
-        (0.004, WAVE | {"integrator": "newmark"}, 2),
+        pytest.param(0.004, WAVE | {"integrator": "newmark"}, 2, marks=pytest.mark.slow),
     ],
 )
 def test_the_estimate_is_the_change_with_many_small_steps(dt, options, order):
@@ -128,7 +128,7 @@ def test_a_run_that_fails_is_no_noise():
     assert sizes == [{}] and np.array_equal(same.data[0].sd, data[0].sd)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the error of the mesh changes")
 def test_a_fit_states_what_its_time_step_does_to_the_numbers():
     """The data come from steps of 1/32. Ratio and relaxation time are wrong by more than their standard errors, as
