@@ -347,4 +347,5 @@ def test_a_normal_in_a_tuple_can_be_unknown():
     slide = SlidingSupport(nodes=jnp.asarray(part(mesh, z_max=0.0)), normal=(0.0, 0.0, 1.0))
     scene = pulled(mesh, [0.0, 0.0, 10.0], physics=(slide,))
     for values in ({"support.0.normal": slide.normal}, {"support.0.normal.0": 0.0}):
-        jax.eval_shape(lambda at: lj.simulate(lj.with_parameters(scene, at)).positions, values)
+        found = jax.eval_shape(lambda at: lj.simulate(lj.with_parameters(scene, at)).positions, values)
+        assert found.shape[1:] == mesh.points.shape

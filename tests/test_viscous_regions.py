@@ -198,4 +198,5 @@ def test_ratios_in_tuples_can_be_unknown(name):
     """The check of regions gave a tuple of JAX tracers to NumPy, so the derivative ended with a traceback."""
     region = lj.Region(elements=jnp.arange(4), viscosity={"ratios": (0.1, 0.5)})
     scene = block(viscosity={"ratios": (0.3, 0.2), "relaxation_times": (0.3, 0.03)}, region=(region,))
-    jax.eval_shape(lambda value: lj.simulate(lj.with_parameters(scene, {name: value})).positions, 0.25)
+    found = jax.eval_shape(lambda value: lj.simulate(lj.with_parameters(scene, {name: value})).positions, 0.25)
+    assert found.shape[1:] == scene.mesh.points.shape
