@@ -6,9 +6,10 @@ import pytest
 
 import liverjax as lj
 from fitting.amplitude import cycle
-from fitting.fits import joint, samples, scene_numbers, stress_stretch, time_tests, together
+from fitting.fits import joint, samples, scene_numbers, stress_stretch, time_tests
 from fitting.fits.families import hyperelastic
 from fitting.fits.scene_numbers import Problem
+from fitting.fits.together import common_fit
 from fitting.methods.generalised_maxwell import Maxwell, moduli
 from fitting.readers.curves import Curve
 from fitting.readers.displacements import Displacements
@@ -66,8 +67,8 @@ WRONG = {
     "shape = 'Sphere' is not known": lambda: hertz.half_space(hertz.Indenter("Sphere", 1.0, 0.5, 1.0), np.ones(1)),
     "over 8 times the thickness": lambda: thin_layer.punch_factor(50.0, 1.0, 0.3),
     "only one of storage_sd and loss_sd": lambda: joint.sweep(SWEEP._replace(storage_sd=0.01 * SWEEP.storage)),
-    "ascending order": lambda: together.fit([Sweep(OMEGA[::-1], SWEEP.storage, SWEEP.loss), TEST], 1),
-    "modes = 1.9 must be a whole number": lambda: together.fit([SWEEP, TEST], 1.9),
+    "ascending order": lambda: common_fit.fit([Sweep(OMEGA[::-1], SWEEP.storage, SWEEP.loss), TEST], 1),
+    "modes = 1.9 must be a whole number": lambda: common_fit.fit([SWEEP, TEST], 1.9),
     "modes = 2.9 must be a whole number": lambda: time_tests.fit(TEST, 2.9),
     "one frequency does not determine a mode": lambda: samples.fit([ONE, ONE]),
     "the times do not ascend": lambda: of_columns("creep", TIME[::-1], np.ones(12), TIME, ("file", [])),

@@ -10,8 +10,8 @@ import pytest
 from fitting.__main__ import main
 from fitting.commands import sweep as sweep_command
 from fitting.commands import together as together_command
-from fitting.fits import together
 from fitting.fits.honesty import common_factor
+from fitting.fits.together import common_fit, doubts, measured_tests
 from fitting.methods import generalised_maxwell
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.frequency_sweep import Sweep
@@ -74,14 +74,14 @@ def test_given_deviations_do_not_hide_the_other_test():
     c, a = shear_waves.velocity_and_attenuation(*generalised_maxwell.moduli(truth, high), high, 1060.0)
     factor = 1 + 0.02 * rng.standard_normal((2, 6))
     tests = [Sweep(low, *noisy, *(0.02 * G), source="s"), Dispersion(high, c * factor[0], a * factor[1], 1060.0)]
-    found = together.fit(tests, 3)
+    found = common_fit.fit(tests, 3)
     assert max(share.misfit for share in found.shares) < 0.04
     assert abs(found.model.shear_modulus - 3000) < 4 * found.uncertainty.standard_errors[0]
 
 
 @pytest.mark.parametrize("attenuation", [True, False])
 def test_waves_add_the_short_time_that_the_sweep_does_not_see(attenuation):
-    found = together.fit([sweep(0.01), waves(0.01, attenuation)], 2)
+    found = common_fit.fit([sweep(0.01), waves(0.01, attenuation)], 2)
     u = found.uncertainty
     assert found.converged
     assert np.all(np.abs(u.values - [3000, 0.4, 0.3, 0.3, 0.002]) < 4 * u.standard_errors)
@@ -98,7 +98,7 @@ def test_a_better_fit_whose_parameters_are_not_determined_is_told(tmp_path, caps
     c, _ = shear_waves.velocity_and_attenuation(*generalised_maxwell.moduli(truth, high), high, 1060.0)
     G = [np.asarray(each) * (1 + 0.01 * rng.standard_normal(14)) for each in generalised_maxwell.moduli(truth, low)]
     test = Dispersion(high, np.asarray(c) * (1 + 0.01 * rng.standard_normal(7)), None, 1060.0)
-    found = together.fit([Sweep(low, *G), test])
+    found = common_fit.fit([Sweep(low, *G), test])
     assert found.modes == 1 and found.model.shear_modulus < 4000
     (told,) = (w for w in found.warnings if w.startswith("2 modes follow the tests better than 1"))
     assert "The stated errors do not contain this difference" in told
@@ -184,7 +184,7 @@ def test_the_structure_of_velocities_and_attenuations_is_tested_separately():
     share = SimpleNamespace(points=len(signs), noise=0.01)
     fitted = [own.measured * (1 + 0.01 * signs)]
     fit = SimpleNamespace(tests=[own], fitted=fitted, solution=solution, shares=[share])
-    (told,) = together.structured(fit)
+    (told,) = doubts.structured(fit)
     assert "waves.csv (velocity): the residuals change sign only 1 times in 12 values" in told
 
 
@@ -199,7 +199,7 @@ def test_waves_have_no_error_of_a_sample_size():
     """The waves had the error of a sample between plates. So sizes seemed to explain too large factors."""
     w = waves(0.003)
     stiffer = w._replace(velocity=np.sqrt(1.03) * w.velocity, attenuation=w.attenuation / np.sqrt(1.03))
-    fit = together.fit([sweep(0.003), stiffer], 2)
+    fit = common_fit.fit([sweep(0.003), stiffer], 2)
     sizes = together_command.errors_of_sizes(SimpleNamespace(radius=None, height=None), fit.tests)
     assert sizes[0] > 0.01 and sizes[1] == 0.0
     (told,) = common_factor.told(fit, sizes)
@@ -222,7 +222,7 @@ def test_errors_of_waves_are_relative_to_smooth_curves():
     noisy, exact = (waves(noise, attenuation=False) for noise in (0.2, 0.0))
     off = [np.std(np.log(scales / exact.measured)) for scales in (noisy.scales, noisy.measured)]
     assert off[0] < 0.7 * off[1]
-    assert np.array_equal(together.reported_numbers(noisy)[2], noisy.scales)
+    assert np.array_equal(measured_tests.reported_numbers(noisy)[2], noisy.scales)
 
 
 def test_the_density_of_a_common_fit_needs_no_height():

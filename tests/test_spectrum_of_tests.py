@@ -10,9 +10,10 @@ from test_models import FORMULAS, TRUTHS, box_spectrum
 from test_springpots_in_time import TIMES, inverse_laplace
 
 from fitting.__main__ import main
-from fitting.fits import samples, time_tests, together
+from fitting.fits import samples, time_tests
 from fitting.fits.families import choice, models, spectrum_of_tests
 from fitting.fits.families.choice import Label
+from fitting.fits.together import doubts, measured_tests
 from fitting.methods import generalised_maxwell, relaxation_spectrum, time_response
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers import time_tests as reader
@@ -82,7 +83,7 @@ def test_no_start_of_scipy_is_below_the_spectrum_of_creep():
     test = in_time("creep", "fractional_kelvin_voigt")
     told, grid, found = spectrum_of_tests.spectrum_of([test], NEAR, np.ones(1))
     L = relaxation_spectrum.second_differences(len(grid.times), grid.smoothing)
-    at, measured, scales = together.reported_numbers(test)
+    at, measured, scales = measured_tests.reported_numbers(test)
     function = partial(time_response.residuals_with_jacobian, "creep", spectrum_of_tests._modes_on_grid(grid))
 
     def rows(x):
@@ -104,7 +105,7 @@ def test_several_tests_have_one_spectrum():
     found = spectrum_of_tests.spectrum_together(tests, NEAR, np.array([0.01, 0.003]))
     sweep, relaxation = found.shares
     assert 0.006 < sweep.noise < 0.015 and 0.0015 < relaxation.noise < 0.005
-    assert sweep.alone < 1.3 * sweep.noise and not together.disagreements(found.shares)
+    assert sweep.alone < 1.3 * sweep.noise and not doubts.disagreements(found.shares)
     rest = found.kind.names.index("equilibrium_modulus")
     own = found.parameters.standard_errors[rest]
     assert abs(found.parameters.values[rest] - TRUTHS[NAME][0]) < 4 * own

@@ -11,9 +11,10 @@ from conftest import SHARED
 import liverjax as lj
 from fitting.__main__ import main
 from fitting.commands import together as command
-from fitting.fits import joint, together, viscoelastic
+from fitting.fits import joint, viscoelastic
 from fitting.fits.families import springpots_in_time
 from fitting.fits.honesty import sizes_of_samples, total_error
+from fitting.fits.together import common_fit, doubts, measured_tests, residuals_of_tests
 from fitting.methods import generalised_maxwell, time_response
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.frequency_sweep import Sweep
@@ -47,8 +48,8 @@ def relaxation(noise: float, scale: np.ndarray | float = 1.0) -> TimeTest:
 
 
 @pytest.fixture(scope="module")
-def found() -> together.Together:
-    return together.fit([sweep(0.02), relaxation(0.005)], 2)
+def found() -> residuals_of_tests.Together:
+    return common_fit.fit([sweep(0.02), relaxation(0.005)], 2)
 
 
 @pytest.mark.parametrize(
@@ -82,7 +83,7 @@ def test_the_noise_of_every_test_is_found_if_it_differs_a_thousandfold():
             TimeTest("relaxation", at, np.ones(41), relaxed * (1 + 1e-4 * three), at > 0),
             TimeTest("creep", at, stress, strain * (1 + 0.1 * four), at > 0),
         ]
-        fit = together.fit(tests, 3)
+        fit = common_fit.fit(tests, 3)
         assert 0.6e-4 < fit.shares[1].misfit < 1.4e-4
         off.append((fit.uncertainty.values[0] - 2000) / fit.uncertainty.standard_errors[0])
     assert np.sqrt(np.mean(np.square(off))) < 2
@@ -99,7 +100,7 @@ def test_the_noise_of_a_short_test_does_not_run_to_zero(points):
         loud = sweep(0.0)
         loud = loud._replace(storage=loud.storage * (1 + 0.1 * noise[0]), loss=loud.loss * (1 + 0.1 * noise[1]))
         few = TimeTest("relaxation", at, np.ones(len(at)), modulus(at) * (1 + 0.03 * noise[2, : len(at)]), at > 0)
-        fit = together.fit([loud, few], 2)
+        fit = common_fit.fit([loud, few], 2)
         assert fit.shares[1].noise > (0.029 if points == 4 else 0.005)
         off.append((fit.uncertainty.values - [800, 0.3, 0.4, 30, 0.1]) / fit.uncertainty.standard_errors)
     assert np.abs(off).max() < 4.5 and np.sqrt(np.mean(np.square(off))) < 1.5
@@ -159,7 +160,7 @@ def test_total_errors_contain_the_sizes_of_the_samples():
     hits, by_noise = [], []
     for seed in range(12):
         factor = 1 + 0.013 * np.random.default_rng(100 + seed).standard_normal()
-        fit = together.fit(wide_and_long(factor, seed), 2)
+        fit = common_fit.fit(wide_and_long(factor, seed), 2)
         shares, u = sizes_of_samples.shares_with_sizes(fit, 0.013), fit.uncertainty
         off, whole = np.abs(u.values - np.array([800, 0.3, 0.4, 30, 0.1])), total_error.root_of_squares(shares)
         rest = abs(float(fit.model.shear_modulus * (1 - fit.model.ratios.sum())) - 240)
@@ -199,7 +200,7 @@ def test_a_factor_of_all_tests_is_one_of_the_shear_modulus_alone():
     creep = TimeTest("creep", at, np.ones(len(at)), strain, at > 0, source="creep.csv")
     x = 1j * OMEGA / 50 * 5.0
     G = 1000 * (1 - g + g * x / (1 + x))
-    fit = together.fit([Sweep(OMEGA / 50, G.real, G.imag, source="sweep.csv"), creep], 1)
+    fit = common_fit.fit([Sweep(OMEGA / 50, G.real, G.imag, source="sweep.csv"), creep], 1)
     assert np.allclose(fit.uncertainty.values, [1000, g, 5.0], rtol=1e-3)
     moved = sizes_of_samples._by_sizes(fit)
     assert np.allclose(moved.sum(axis=1), [1000, 0, 0], atol=[5, 5e-3, 5e-2])
@@ -287,7 +288,7 @@ def test_the_errors_are_those_of_the_stacked_rows(found):
 
 
 def test_tests_that_do_not_agree_are_named():
-    told = together.fit([sweep(0.02), relaxation(0.005, 1.4)], 2).warnings
+    told = common_fit.fit([sweep(0.02), relaxation(0.005, 1.4)], 2).warnings
     assert any("the tests do not agree" in w and "otherwise try more modes" in w for w in told)
 
 
@@ -360,7 +361,7 @@ def test_the_largest_error_has_the_divisors_of_the_mean(found):
     noisy = stress + 0.01 * stress.max() * np.random.default_rng(2).standard_normal(100)
     cycle = TimeTest("relaxation", time, strain, noisy, time > 0)
     largest = together_report._largest(found._replace(tests=[cycle], fitted=[stress[1:]]))
-    assert largest == [together.relative_errors_of(cycle, stress[1:]).max()] and 0.02 < largest[0] < 0.1
+    assert largest == [measured_tests.relative_errors_of(cycle, stress[1:]).max()] and 0.02 < largest[0] < 0.1
 
 
 def test_three_velocities_determine_nothing_alone_and_do_not_disagree():
@@ -372,7 +373,7 @@ def test_three_velocities_determine_nothing_alone_and_do_not_disagree():
         noise = np.random.default_rng(seed).standard_normal((3, 25))
         G = [part * (1 + 0.02 * n) for part, n in zip(generalised_maxwell.moduli(TRUTH, omega), noise, strict=False)]
         waves = Dispersion(others, velocity * (1 + 0.03 * noise[2, :3]), None, 1000.0, "waves.csv")
-        fit = together.fit([Sweep(omega, *G, source="sweep.csv"), waves], 2)
+        fit = common_fit.fit([Sweep(omega, *G, source="sweep.csv"), waves], 2)
         assert np.all(np.isinf(fit.shares[0].errors_without[1:]))  # velocities far above the times determine G0
         told += any("the tests do not agree. The misfit" in w for w in fit.warnings)
     assert not told
@@ -380,12 +381,12 @@ def test_three_velocities_determine_nothing_alone_and_do_not_disagree():
 
 def test_what_no_fit_follows_is_told():
     """A test with a misfit of 63 % in the common fit and of 44 % alone does not disagree with the others."""
-    share = together.Share("sweep", "b.csv", 38, 1.2, 1.0, 0.63, 0.44, 0.3, np.ones(3))
-    assert together.disagreements([share]) == []
-    assert together.missed([share]) == [
+    share = residuals_of_tests.Share("sweep", "b.csv", 38, 1.2, 1.0, 0.63, 0.44, 0.3, np.ones(3))
+    assert doubts.disagreements([share]) == []
+    assert doubts.missed([share]) == [
         "the fit misses the data of b.csv by 63 %: if this is not noise, use another --model"
     ]
-    assert together.missed([share._replace(misfit=0.04)]) == []
+    assert doubts.missed([share._replace(misfit=0.04)]) == []
 
 
 def test_the_driven_column_is_the_one_that_is_held(tmp_path):
@@ -446,7 +447,7 @@ def test_given_deviations_are_believed_beside_another_test(model):
 
 
 def test_the_mean_error_is_not_above_the_largest_one(tmp_path):
-    found = together.fit([with_deviations(0.02, 0.02), relaxation(0.005)], 2)
+    found = common_fit.fit([with_deviations(0.02, 0.02), relaxation(0.005)], 2)
     content = together_report.write(tmp_path, found, 0.013)
     assert (
         0.005 < content["mean_relative_error"] < 0.03 and content["mean_relative_error"] < content["max_relative_error"]
@@ -482,7 +483,7 @@ def test_what_a_common_fit_does_not_have_is_refused(more, words, tmp_path, capsy
 
 def test_a_number_of_modes_beyond_the_tests_is_refused():
     with pytest.raises(InputError, match="give 1 to"):
-        together.fit([sweep(0.02), relaxation(0.005)], 60)
+        common_fit.fit([sweep(0.02), relaxation(0.005)], 60)
 
 
 @pytest.mark.slow

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from fitting.fits import together, viscoelastic
+from fitting.fits import viscoelastic
 from fitting.fits.honesty import edges
 from fitting.fits.honesty.long_times import INTERVAL
+from fitting.fits.together import common_fit
 from fitting.methods import generalised_maxwell
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.rheometer import Sweep
@@ -47,7 +48,7 @@ def test_noise_of_the_loss_is_no_structure_beside_another_test(seed, missed):
     sweep, at = _with_noisy_loss(seed, missed), np.append(0.0, np.geomspace(0.02, 100, 30))
     answer = 1000 * (0.3 + 0.4 * np.exp(-at / 0.1) + 0.3 * np.exp(-at / 3))
     answer *= 1 + 0.02 * np.random.default_rng(seed).standard_normal(31)
-    fit = together.fit([sweep, TimeTest("relaxation", at, np.ones(31), answer, at > 0, source="relaxation.csv")], 2)
+    fit = common_fit.fit([sweep, TimeTest("relaxation", at, np.ones(31), answer, at > 0, source="relaxation.csv")], 2)
     assert any("structured" in w for w in fit.warnings) == (missed > 0)
 
 

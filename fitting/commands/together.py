@@ -12,7 +12,7 @@ from fitting.commands.progress import named_bar
 from liverjax.core.errors import InputError
 
 if TYPE_CHECKING:
-    from fitting.fits.together import Measured
+    from fitting.fits.together.measured_tests import Measured
 
 
 def run(options: argparse.Namespace) -> int:

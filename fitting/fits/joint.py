@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fitting.fits import viscoelastic
-from fitting.fits.together import QUIETEST
+from fitting.fits.together.measured_tests import QUIETEST
 from fitting.methods import generalised_maxwell
 from fitting.methods.estimate import Estimate, bias_sentences, estimated, mesh_bias
 from fitting.methods.least_squares import levenberg_marquardt_host

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.stats
 
 from fitting.fits import time_tests
-from fitting.fits.together import Measured, name_of, reported_numbers, series_of, sizes_of
+from fitting.fits.together.measured_tests import Measured, name_of, reported_numbers, series_of, sizes_of
 from fitting.fits.viscoelastic import Fit
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.frequency_sweep import Sweep

@@ -10,7 +10,8 @@ from fitting.fits.families import limits
 from fitting.fits.honesty import sizes_of_samples, total_error
 from fitting.fits.honesty.long_times import INTERVAL
 from fitting.fits.time_tests import thinned
-from fitting.fits.together import Share, Together, relative_errors_of
+from fitting.fits.together.measured_tests import relative_errors_of
+from fitting.fits.together.residuals_of_tests import Share, Together
 from fitting.methods.generalised_maxwell import moduli
 from fitting.methods.uncertainty import equilibrium_error
 from fitting.readers.frequency_sweep import Sweep

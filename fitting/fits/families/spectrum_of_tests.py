@@ -11,10 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitting.fits import time_tests, together
+from fitting.fits import time_tests
 from fitting.fits.families import limits
 from fitting.fits.time_tests import TimeFit
-from fitting.fits.together import Measured, Together
+from fitting.fits.together import contributions, measured_tests, residuals_of_tests
+from fitting.fits.together.measured_tests import Measured
+from fitting.fits.together.residuals_of_tests import Together
 from fitting.fits.viscoelastic import Kind
 from fitting.methods import as_prony_modes, generalised_maxwell, host, relaxation_spectrum, uncertainty
 from fitting.methods.estimate import Estimate, estimated
@@ -73,7 +75,7 @@ def _minimum(kinds: list[str], data: list, grid: GridOfTimes, x: np.ndarray) -> 
     kind = Kind("spectrum", _modes_on_grid(grid))
 
     def at(x):
-        r, J = together.tests_evaluated(kinds, kind, x, data)
+        r, J = residuals_of_tests.tests_evaluated(kinds, kind, x, data)
         cost = r @ r + np.sum((L @ x) ** 2)
         return r, J, cost if np.isfinite(cost) and np.all(np.isfinite(J)) else np.inf
 
@@ -108,8 +110,8 @@ def spectrum_of(
             modes.
         noise: relative noise of each test.
     """
-    low, high = together.resolved_by(tests)
-    kinds, data = list(map(together.name_of, tests)), _weighed_parts(tests, noise)
+    low, high = measured_tests.resolved_by(tests)
+    kinds, data = list(map(measured_tests.name_of, tests)), _weighed_parts(tests, noise)
     best = None
     for per_decade in relaxation_spectrum.GRIDS:
         times = relaxation_spectrum.grid_of_times(low, high, per_decade)
@@ -128,7 +130,7 @@ def spectrum_of(
 
 
 def _weighed_parts(tests: Sequence[Measured], noise: np.ndarray) -> list:
-    parts = map(together.reported_numbers, tests)
+    parts = map(measured_tests.reported_numbers, tests)
     return [(at, y, scales * s) for (at, y, scales), s in zip(parts, noise, strict=True)]
 
 
@@ -137,7 +139,7 @@ def _as_a_fit(
 ) -> SpectrumFit:
     """Return the spectrum `told` as a fit. `over`: function that divides the residuals at the minimum by their noise.
     If `over` is None, the noise is estimated from the residuals."""
-    low, high = together.resolved_by(tests)
+    low, high = measured_tests.resolved_by(tests)
     kept = found.x[1:] > 1e-10 * found.x.max()
     solid = told.equilibrium > 0
     free = np.concatenate([[solid], kept])
@@ -186,11 +188,11 @@ def _as_a_fit(
 
 
 def _relative_scale(test: Measured) -> float:
-    """Return the median of the scales of a test, divided by the measured values (`together.sizes_of`). For a sweep, it
+    """Return the median of the scales of a test, divided by the measured values (`sizes_of`). For a sweep, it
     is the median of G' only."""
-    _, y, scales = together.reported_numbers(test)
+    _, y, scales = measured_tests.reported_numbers(test)
     count = len(y) // 2 if isinstance(test, Sweep) else len(y)
-    return float(np.median((scales / together.sizes_of(test))[:count]))
+    return float(np.median((scales / measured_tests.sizes_of(test))[:count]))
 
 
 def _still_relaxing(tests: Sequence[Measured], told: GridSpectrum, noises: np.ndarray) -> tuple[str, ...]:
@@ -211,7 +213,7 @@ def spectrum_in_time(test: TimeTest, near: Maxwell) -> TimeFit:
     test."""
     told, grid, found = spectrum_of([test], near, np.ones(1))
     fit = _as_a_fit([test], grid, found, told)
-    _, answer, scales = together.reported_numbers(test)
+    _, answer, scales = measured_tests.reported_numbers(test)
     where = (test.time[time_tests.thinned(test)], answer, found.r * scales + answer, scales)
     own = (fit.kind, fit.model, fit.solution, fit.spread, found.converged)
     sentences = (*fit.sentences, *_still_relaxing([test], told, np.array([fit.spread.noise])))
@@ -221,17 +223,19 @@ def spectrum_in_time(test: TimeTest, near: Maxwell) -> TimeFit:
 def spectrum_together(tests: list[Measured], near: Maxwell, noise: np.ndarray) -> Together:
     """Fit one smooth spectrum to several tests. Each test has its individual noise level. `near` and `noise` are the
     same as in `spectrum_of`."""
-    parts = [together.reported_numbers(t) for t in tests]
+    parts = [measured_tests.reported_numbers(t) for t in tests]
     for _ in range(2):
         told, grid, found = spectrum_of(tests, near, noise)
-        used, noise = noise, together.noises(tests, parts, found.r, noise, told.effective)
+        used, noise = noise, residuals_of_tests.noises(tests, parts, found.r, noise, told.effective)
     data = _weighed_parts(tests, used)
-    shares, fitted = together.misfits(tests, data, found.r, noise, told.effective)
-    fit = _as_a_fit(tests, grid, found, told, lambda whole: together.over_own_noise(whole, shares, used / noise))
+    shares, fitted = residuals_of_tests.misfits(tests, data, found.r, noise, told.effective)
+    fit = _as_a_fit(
+        tests, grid, found, told, lambda whole: residuals_of_tests.over_own_noise(whole, shares, used / noise)
+    )
     own = (tests, fit.kind, fit.model, fit.solution, fit.spread, found.converged)
     sentences = (*fit.sentences, *_still_relaxing(tests, told, noise))
     first = Together(*own, shares, fitted, [], sentences, 0.0, 0.0, fit.own, fit.details)
-    kinds = list(map(together.name_of, tests))
+    kinds = list(map(measured_tests.name_of, tests))
 
     def alone(k: int) -> np.ndarray:
         without = [(at, y, s if j == k else np.full(len(y), np.inf)) for j, (at, y, s) in enumerate(parts)]
@@ -240,5 +244,5 @@ def spectrum_together(tests: list[Measured], near: Maxwell, noise: np.ndarray) -
 
     slope = np.diag(fit.own.values)
     return first._replace(
-        shares=together.shares_by_rows(first, np.asarray(fit.solution.jacobian), slope, fit.own.values, alone)
+        shares=contributions.shares_by_rows(first, np.asarray(fit.solution.jacobian), slope, fit.own.values, alone)
     )

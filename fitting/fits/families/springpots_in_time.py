@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeVar
 import jax
 import numpy as np
 
-from fitting.fits import time_tests, together
+from fitting.fits import time_tests
 from fitting.fits.families import choice, limits, models, spectrum_of_tests
 from fitting.fits.honesty import common_factor
 from fitting.fits.honesty.alike_answers import fitted_by_its_noise, with_offset_errors, with_own_noise
@@ -21,7 +21,9 @@ from fitting.fits.honesty.long_times import with_interval
 from fitting.fits.honesty.rise_of_load import with_rise_of_load
 from fitting.fits.honesty.short_times import with_short_times
 from fitting.fits.time_tests import CONSTANT_NOISE, TimeFit
-from fitting.fits.together import Measured, Share, Together
+from fitting.fits.together import common_fit, contributions, doubts, measured_tests, residuals_of_tests
+from fitting.fits.together.measured_tests import Measured
+from fitting.fits.together.residuals_of_tests import Share, Together
 from fitting.fits.viscoelastic import Kind
 from fitting.methods import as_prony_modes, generalised_maxwell, host, springpots, uncertainty
 from fitting.methods.estimate import Estimate, estimated
@@ -53,7 +55,7 @@ class Spans(NamedTuple):
 
 def spans_of(tests: Sequence[Measured]) -> Spans:
     """Return the times of the modes and the reference frequency, for the range of times that the tests resolve."""
-    low, high = together.resolved_by(tests)
+    low, high = measured_tests.resolved_by(tests)
     return Spans(low, high, springpots.times_of_modes(low, high), float(1 / np.sqrt(low * high)))
 
 
@@ -71,7 +73,7 @@ def residuals_of_springpot(name: str, test: TimeTest) -> Callable[[jax.Array], j
     """Return a JAX function from the variables u of the springpot model `name` to the residuals (m,) of the m measured
     values of a relaxation or creep test."""
     (case,) = (c for c in FRACTIONAL if c.name == name)
-    maxwell, (at, measured, scales) = _dense_modes(case, spans_of([test])), together.reported_numbers(test)
+    maxwell, (at, measured, scales) = _dense_modes(case, spans_of([test])), measured_tests.reported_numbers(test)
 
     def of(u):
         return (time_tests.response_in_time(test.kind, maxwell(u), *at) - measured) / scales
@@ -87,7 +89,7 @@ def _minimum_of_case(case: Fractional, tests: Sequence[Measured], starts: np.nda
     residuals.
     """
     kind = Kind(case.name, _dense_modes(case, spans_of(tests)))
-    evaluate = partial(together.tests_evaluated, list(map(together.name_of, tests)), kind)
+    evaluate = partial(residuals_of_tests.tests_evaluated, list(map(measured_tests.name_of, tests)), kind)
     return from_starts(evaluate, starts, data, max_iterations=MOST_STEPS)
 
 
@@ -163,7 +165,7 @@ def able(fit: TimeFit | Together, data: uncertainty.Band) -> bool:
 
 def fractional_in_time(test: TimeTest, near: Maxwell) -> list[TimeFit]:
     """Fit every springpot model to a relaxation or creep test. `near`: Prony modes that give the starting points."""
-    spans, data = spans_of([test]), [together.reported_numbers(test)]
+    spans, data = spans_of([test]), [measured_tests.reported_numbers(test)]
     _, answer, scales = data[0]
     out = []
     for case, starts in zip(FRACTIONAL, _starts_near(near, spans), strict=True):
@@ -274,19 +276,23 @@ def _cautions_in_time(fit: TimeFit) -> list[str]:
 def fractional_together(tests: list[Measured], near: Maxwell) -> list[Together]:
     """Fit every springpot model to several tests. Each test has its individual noise level. `near`: Prony modes that
     give the starting points."""
-    spans, parts = spans_of(tests), [together.reported_numbers(t) for t in tests]
+    spans, parts = spans_of(tests), [measured_tests.reported_numbers(t) for t in tests]
     out = []
     for case, starts in zip(FRACTIONAL, _starts_near(near, spans), strict=True):
-        begin, noise = perf_counter(), np.array([together.first_noise(t) for t in tests])
-        for _ in range(together.ROUNDS):
+        begin, noise = perf_counter(), np.array([measured_tests.first_noise(t) for t in tests])
+        for _ in range(common_fit.ROUNDS):
             used, data = noise, [(at, y, scales * s) for (at, y, scales), s in zip(parts, noise, strict=True)]
             minimum = _minimum_of_case(case, tests, starts, data)
-            noise = together.noises(tests, parts, np.asarray(minimum.residuals), noise, np.asarray(minimum.jacobian))
+            noise = residuals_of_tests.noises(
+                tests, parts, np.asarray(minimum.residuals), noise, np.asarray(minimum.jacobian)
+            )
             starts = np.asarray(minimum.u)[None]  # the next round begins near the minimum
-            if np.all(np.abs(noise / used - 1) < together.SETTLED):
+            if np.all(np.abs(noise / used - 1) < common_fit.SETTLED):
                 break
-        shares, fitted = together.misfits(tests, data, np.asarray(minimum.residuals), noise, len(case.free))
-        found = _springpot_at(case, together.over_own_noise(minimum, shares, used / noise), spans, over_noise=True)
+        shares, fitted = residuals_of_tests.misfits(tests, data, np.asarray(minimum.residuals), noise, len(case.free))
+        found = _springpot_at(
+            case, residuals_of_tests.over_own_noise(minimum, shares, used / noise), spans, over_noise=True
+        )
         own = (tests, found.kind, found.model, found.solution, found.spread, bool(found.solution.converged))
         out.append(Together(*own, shares, fitted, [], found.sentences, perf_counter() - begin, 0.0, found.own))
     return out
@@ -300,13 +306,13 @@ def choose_together(
     relative: float | np.ndarray = 0.0,
 ) -> Together:
     """Return the fit of several tests with the lowest information criterion. The arguments `model` and `modes` are
-    those of `choose_in_time`, and `progress` is that of `together.fit`.
+    those of `choose_in_time`, and `progress` is that of `common_fit.fit`.
 
     `relative`: relative errors (K,) of all moduli of the K tests due to the sizes of their samples, or one number for
     all tests.
     """
     tests = [_by_its_noise(test) for test in tests]
-    prony = together.fit(tests, modes, progress)
+    prony = common_fit.fit(tests, modes, progress)
     fit = prony if model == "prony" else _best_of_models(tests, model, prony, progress)
     fit = fit._replace(warnings=(*fit.warnings, *common_factor.told(fit, relative)))
     noises = [s.noise for s in fit.shares]
@@ -324,7 +330,7 @@ def _by_its_noise(test: Measured) -> Measured:
 
 def _best_of_models(tests: list[Measured], model: str, prony: Together, progress: Callable[[str], None]) -> Together:
     """Return the fit with the lowest information criterion among `prony` and the other models that `model` selects."""
-    band = together.ResolvedBand(spans_of(tests)[:2])
+    band = measured_tests.ResolvedBand(spans_of(tests)[:2])
     tried = [prony] if model == "auto" else []
     if model in ("fractional", "auto"):
         progress("springpots")
@@ -334,8 +340,8 @@ def _best_of_models(tests: list[Measured], model: str, prony: Together, progress
         noise = np.array([s.noise for s in prony.shares])
         tried.append(spectrum_of_tests.spectrum_together(tests, prony.model, noise))
     fits = [f for f in tried if able(f, band)] or tried
-    best = _preferred_of(fits, together.criterion_of_all)
-    rows = _compared_models(tried, together.criterion_of_all, band)
+    best = _preferred_of(fits, residuals_of_tests.criterion_of_all)
+    rows = _compared_models(tried, residuals_of_tests.criterion_of_all, band)
     seconds = {n: sum(getattr(f, n) for f in {id(f): f for f in (*tried, prony)}.values()) for n in TIMES}
     if best is prony:
         return best._replace(tried=rows, **seconds)
@@ -343,10 +349,10 @@ def _best_of_models(tests: list[Measured], model: str, prony: Together, progress
         progress("what each test adds")
         best = best._replace(shares=_shares_of_springpots(best))
     out = [*best.warnings] if best.converged else ["the fit did not converge: try another --model", *best.warnings]
-    out += together.disagreements(best.shares, "try another --model")
-    out += together.missed(best.shares)
-    out += together.of_rises(prony)  # its relaxation times show whether the material relaxes during the rise
-    out += together.structured(best)
+    out += doubts.disagreements(best.shares, "try another --model")
+    out += doubts.missed(best.shares)
+    out += doubts.of_rises(prony)  # its relaxation times show whether the material relaxes during the rise
+    out += doubts.structured(best)
     out += models.undetermined(best)
     return best._replace(tried=rows, warnings=tuple(out), **seconds)
 
@@ -355,7 +361,7 @@ def _shares_of_springpots(fit: Together) -> list[Share]:
     """Return the contribution of each test to the common fit: the standard errors of the springpot parameters if this
     test is left out, and the misfit of a fit to this test alone."""
     (case,) = (c for c in FRACTIONAL if c.name == fit.kind.name)
-    parts = [together.reported_numbers(t) for t in fit.tests]
+    parts = [measured_tests.reported_numbers(t) for t in fit.tests]
     assert fit.kind.values is not None and fit.parameters is not None
     u = np.asarray(fit.solution.u)
     _, slope = host.with_jacobian(fit.kind.values, u)
@@ -365,4 +371,4 @@ def _shares_of_springpots(fit: Together) -> list[Share]:
         data = [(at, y, scales if j == k else np.full(len(y), np.inf)) for j, (at, y, scales) in enumerate(parts)]
         return np.asarray(_minimum_of_case(case, fit.tests, starts, data).residuals)
 
-    return together.shares_by_rows(fit, np.asarray(fit.solution.jacobian), slope, fit.parameters.values, alone)
+    return contributions.shares_by_rows(fit, np.asarray(fit.solution.jacobian), slope, fit.parameters.values, alone)

@@ -9,7 +9,8 @@ import numpy as np
 
 from fitting.fits import time_tests, viscoelastic
 from fitting.fits.time_tests import INDEPENDENT, TimeFit
-from fitting.fits.together import Measured, Together, reported_numbers
+from fitting.fits.together.measured_tests import Measured, reported_numbers
+from fitting.fits.together.residuals_of_tests import Together
 from fitting.methods import host, uncertainty
 from fitting.methods.estimate import Estimate, errors_and_correlation
 from fitting.methods.noise.alike_noise import alike_noise

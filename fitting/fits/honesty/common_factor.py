@@ -10,8 +10,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from fitting.fits import together
-from fitting.fits.together import Together
+from fitting.fits.together import contributions, doubts, measured_tests, residuals_of_tests, starting_points
+from fitting.fits.together.residuals_of_tests import Together
 from fitting.fits.viscoelastic import Kind
 from fitting.methods.estimate import spread
 from fitting.methods.generalised_maxwell import Maxwell
@@ -61,14 +61,14 @@ def factor_of(fit: Together, k: int) -> tuple[float, float, float] | None:
 
     Returns None if the factor is 1 within its error, or if the misfit of a test is still large.
     """
-    names = list(map(together.name_of, fit.tests))
-    parts = [together.reported_numbers(t) for t in fit.tests]
+    names = list(map(measured_tests.name_of, fit.tests))
+    parts = [measured_tests.reported_numbers(t) for t in fit.tests]
     data = [(at, y, scales * s.alone) for (at, y, scales), s in zip(parts, fit.shares, strict=True)]
     each = [_as_the_others(fit.kind.maxwell), _with_factor(fit.kind.maxwell)]
 
     def evaluate(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         rows = [
-            together.tests_evaluated([name], Kind(maxwell=each[j == k]), u, [own])
+            residuals_of_tests.tests_evaluated([name], Kind(maxwell=each[j == k]), u, [own])
             for j, (name, own) in enumerate(zip(names, data, strict=True))
         ]
         r, J = zip(*rows, strict=True)
@@ -78,7 +78,7 @@ def factor_of(fit: Together, k: int) -> tuple[float, float, float] | None:
     if fit.kind.values is not None:  # the starting points below are for Prony modes
         return _certain(from_starts(evaluate, common), counts)
     # If tests contradict each other, their common fit may have too few modes. So more modes are tried too.
-    more, answer = together.MORE if together.disagreements(fit.shares) else 0, None
+    more, answer = contributions.MORE if doubts.disagreements(fit.shares) else 0, None
     for modes in range(fit.modes, fit.modes + 1 + more):
         starts = _starts_at_the_others(fit, k, modes)
         starts = np.concatenate([common, starts]) if modes == fit.modes else starts
@@ -95,7 +95,7 @@ def _certain(found: Solution, counts: list[int]) -> tuple[float, float, float] |
     worst = max(float(np.sqrt(np.mean(r**2))) for r in left)
     last = np.eye(len(found.u))[-1:]
     error = float(np.linalg.norm(spread(np.asarray(found.jacobian), max(1.0, worst), last)[0]))
-    if worst > together.APART or not abs(found.u[-1]) > max(CERTAIN * error, LEAST):
+    if worst > doubts.APART or not abs(found.u[-1]) > max(CERTAIN * error, LEAST):
         return None
     factor = float(np.exp(found.u[-1]))
     return factor, factor * error, worst
@@ -106,10 +106,10 @@ def _starts_at_the_others(fit: Together, k: int, modes: int) -> np.ndarray:
     prediction of test k to its measured values. For a large factor, the common fit is not a good starting point.
     """
     others = [t for j, t in enumerate(fit.tests) if j != k]
-    band = together.ResolvedBand(together.resolved_by(others))
-    found = together.starts_of_all(others, band, modes, fit.kind)
-    own = _, measured, scales = together.reported_numbers(fit.tests[k])
-    residuals, _ = together.tests_evaluated([together.name_of(fit.tests[k])], fit.kind, found, [own])
+    band = measured_tests.ResolvedBand(measured_tests.resolved_by(others))
+    found = starting_points.starts_of_all(others, band, modes, fit.kind)
+    own = _, measured, scales = measured_tests.reported_numbers(fit.tests[k])
+    residuals, _ = residuals_of_tests.tests_evaluated([measured_tests.name_of(fit.tests[k])], fit.kind, found, [own])
     with np.errstate(all="ignore"):
         apart = np.abs(np.log(np.abs(measured / (residuals * scales + measured))))
     size = np.nan_to_num(np.median(apart, axis=-1), nan=0.0, posinf=0.0)

@@ -13,10 +13,12 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 import scipy.special
 
-from fitting.fits import time_tests, together
+from fitting.fits import time_tests
 from fitting.fits.honesty import alike_points
 from fitting.fits.time_tests import TimeFit
-from fitting.fits.together import Measured, Together
+from fitting.fits.together import measured_tests, residuals_of_tests
+from fitting.fits.together.measured_tests import Measured
+from fitting.fits.together.residuals_of_tests import Together
 from fitting.fits.viscoelastic import SHORT, Fit, Kind
 from fitting.methods.estimate import without_part
 from fitting.methods.generalised_maxwell import Maxwell
@@ -76,7 +78,7 @@ def equilibrium_interval(
         error: standard error [Pa] of the equilibrium modulus; it may be infinite.
         independent: number of independent residuals, divided by the number of all residuals.
     """
-    low, high = together.resolved_by(tests)
+    low, high = measured_tests.resolved_by(tests)
     family = _family(tests, noises, (low / BEYOND, high * BEYOND))
     rest = float(model.shear_modulus * (1 - np.sum(model.ratios)))
     whole = float(model.shear_modulus)
@@ -99,9 +101,9 @@ def equilibrium_interval(
 
 def _family(tests: Sequence[Measured], noises: Sequence[float], times: tuple[float, float]) -> _Family:
     ends = (float(np.log(times[0])), float(np.log(times[1])))
-    parts = [together.reported_numbers(test) for test in tests]
+    parts = [measured_tests.reported_numbers(test) for test in tests]
     data = [(at, y, scales * s) for (at, y, scales), s in zip(parts, noises, strict=True)]
-    names = list(map(together.name_of, tests))
+    names = list(map(measured_tests.name_of, tests))
 
     def evaluate(modulus: float, starts: np.ndarray) -> Solution:
         def maxwell(u: Array) -> Maxwell:
@@ -112,7 +114,7 @@ def _family(tests: Sequence[Measured], noises: Sequence[float], times: tuple[flo
             return Maxwell(whole, strengths / whole[..., None], times)
 
         def at(u: np.ndarray, *_: object) -> tuple[np.ndarray, np.ndarray]:
-            return together.tests_evaluated(names, Kind("prony", maxwell), u, data)
+            return residuals_of_tests.tests_evaluated(names, Kind("prony", maxwell), u, data)
 
         return from_starts(at, starts, max_iterations=ITERATIONS)
 
@@ -186,7 +188,7 @@ def with_interval(
     model = fit.model._replace(shear_modulus=np.asarray(fit.model.shear_modulus) / factor)
     error = equilibrium_error(fit.uncertainty)
     details: Content = fit.details or {}
-    points = sum(len(together.reported_numbers(test)[1]) for test in tests)
+    points = sum(len(measured_tests.reported_numbers(test)[1]) for test in tests)
     known = (details[key] for key in (time_tests.INDEPENDENT, alike_points.INDEPENDENT) if key in details)
     independent = float(next(known, points)) / points
     found = equilibrium_interval(tests, noises, model, error / factor, independent)

@@ -9,8 +9,8 @@ from functools import partial
 
 import numpy as np
 
-from fitting.fits import together
-from fitting.fits.together import Together
+from fitting.fits.together import measured_tests
+from fitting.fits.together.residuals_of_tests import Together
 from fitting.methods import uncertainty
 from fitting.methods.estimate import with_slope
 from fitting.waves.dispersion import Dispersion
@@ -50,9 +50,9 @@ def _by_sizes(fit: Together) -> np.ndarray:
         return np.zeros((len(slope), len(fit.tests)))
     moved, first = np.zeros((len(J), len(fit.tests))), 0
     for k, (test, share) in enumerate(zip(fit.tests, fit.shares, strict=True)):
-        _, measured, scales = together.reported_numbers(test)
+        _, measured, scales = measured_tests.reported_numbers(test)
         if not isinstance(test, Dispersion):  # waves do not depend on the size of the sample
-            sign = -1.0 if together.name_of(test) == "creep" else 1.0  # a stiffer sample creeps less
+            sign = -1.0 if measured_tests.name_of(test) == "creep" else 1.0  # a stiffer sample creeps less
             moved[first : first + share.points, k] = sign * measured / (scales * share.noise)
         first += share.points
     size = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
