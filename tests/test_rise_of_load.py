@@ -9,7 +9,7 @@ from test_time_tests import SOLID, driven, write
 
 from fitting.__main__ import main
 from fitting.fits import time_tests as fits
-from fitting.readers.scattering_load import without_scatter
+from fitting.readers.checks.scattering_load import without_scatter
 from fitting.readers.time_tests import TimeTest, read_time_test
 
 pytestmark = pytest.mark.quick_to_compile

@@ -6,9 +6,9 @@ import pytest
 from fitting.fits import viscoelastic
 from fitting.fits.honesty import edges
 from fitting.methods import generalised_maxwell
+from fitting.readers.checks.scattering_phase import weighed_by_scatter
 from fitting.readers.frequency_sweep import some
 from fitting.readers.rheometer import Sweep, read_sweep
-from fitting.readers.scattering_phase import weighed_by_scatter
 
 pytestmark = pytest.mark.quick_to_compile
 

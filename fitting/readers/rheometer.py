@@ -10,12 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
+from fitting.readers.checks.scattering_phase import weighed_by_scatter
+
 # Some of these names are imported only for users: `fitting.rheometer` exports all names of this module.
 from fitting.readers.frequency_sweep import FEWEST, Sweep, mostly_repeated, without_copies
 from fitting.readers.frequency_sweep import some as some
 from fitting.readers.frequency_sweep import within as within
 from fitting.readers.frequency_sweep import without_inertia as without_inertia
-from fitting.readers.scattering_phase import weighed_by_scatter
 from fitting.readers.tables.complex_moduli import column_in_si, fault_of, storage_and_loss, to_shear
 from fitting.readers.tables.sweep_columns import MODULI, Column, is_tensile
 from fitting.readers.tables.sweep_headings import known_unit

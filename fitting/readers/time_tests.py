@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from fitting.readers.base_line import OFFSET, RESTING, base_line
+from fitting.readers.checks.course_in_time import BEYOND_NOISE, another_course, of_ringing, of_the_other_kind
+from fitting.readers.checks.scattering_load import without_scatter
 from fitting.readers.noise_of_series import (
     noise_of_series,
     rounding_at_rest,
@@ -14,7 +16,6 @@ from fitting.readers.noise_of_series import (
     smooth_sizes,
     told_of_far_values,
 )
-from fitting.readers.scattering_load import without_scatter
 from fitting.readers.tables.time_columns import FORMS, beyond_small, read_columns
 from liverjax.core.errors import InputError
 
@@ -155,7 +156,7 @@ def read_time_test(
             f"torque; displacement and force. The file has {', '.join(columns)}"
         )
     if form[0] in ("modulus", "compliance"):
-        notes += _another_course(str(path), kind, time, columns[form[0]], (ramp or 0.0, start))
+        notes += another_course(str(path), kind, time, columns[form[0]], (ramp or 0.0, start))
         time, driven, answer = _as_a_step(str(path), time, columns[form[0]], ramp or 0.0)
         if sample.radius is not None or sample.height is not None:
             notes.append(
@@ -172,7 +173,7 @@ def read_time_test(
     else:
         strain, stress, told = _as_shear(str(path), form, columns, sample)
         notes += told
-        notes += _of_the_other_kind(kind, time, strain, stress)
+        notes += of_the_other_kind(kind, time, strain, stress)
         driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
         own_time, own_drive = time, driven
         time, driven, answer, told = from_rest(time, driven, answer, ramp, (str(path), "--ramp"))
@@ -208,7 +209,7 @@ def of_columns(
     """
     if np.any(np.diff(time) < 0):
         raise InputError(f"{source[0]}: the times do not ascend; sort the rows by time")
-    told = _ringing(time, driven, answer, start) if kind == "creep" else []
+    told = of_ringing(time, driven, answer, start) if kind == "creep" else []
     return _checked(TimeTest(kind, time, driven, answer, time > 0, source[0], (*source[1], *told)), start)
 
 
@@ -329,35 +330,6 @@ def kind_of(path: str | os.PathLike) -> str:
     return "relaxation" if moves[0] <= moves[1] else "creep"
 
 
-def _of_the_other_kind(kind: str, time: np.ndarray, strain: np.ndarray, stress: np.ndarray) -> list[str]:
-    """Return a note if the imposed quantity of this kind of test changes in the second half, while the other quantity
-    is constant.
-
-    No note is given if the rate of change is constant, because some samples are strained at a constant rate until their
-    stress is steady.
-    """
-    driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
-    late = len(driven) // 2
-    moves, held = (np.std(v[late:]) / max(float(np.max(np.abs(v))), 1e-300) for v in (driven, answer))
-    if not (held < HELD and moves > 3 * held and moves > HELD):
-        return []
-    bent = driven[late:] - np.polyval(np.polyfit(time[late:], driven[late:], 1), time[late:])
-    if np.std(bent) < STEADY * np.std(driven[late:]):
-        return []
-    names = ("stress", "strain", "creep") if kind == "relaxation" else ("strain", "stress", "relaxation")
-    return [
-        f"the {names[0]} is constant and the {names[1]} changes, as in a {names[2]} test: use python -m fitting "
-        f"{names[2]}. The command {kind} assumes that the {names[1]} has no noise"
-    ]
-
-
-#: A quantity counts as constant if its relative standard deviation in the second half of the test is below this [1].
-HELD = 0.01
-#: A quantity changes at a constant rate if its standard deviation from a straight line is below this fraction of its
-#: standard deviation from the mean.
-STEADY = 0.05
-
-
 def _own_table(kind: str) -> str:
     return "modulus" if kind == "relaxation" else "compliance"
 
@@ -375,86 +347,6 @@ def _as_a_step(path, time, modulus, ramp):
     answer = np.full(len(times), np.nan)
     answer[np.searchsorted(times, time[kept])] = modulus[kept]
     return times, np.minimum(times / ramp, 1.0) if ramp else np.ones(len(times)), answer
-
-
-#: The limit for the rise of a modulus and for the fall of a compliance is _WRONG_WAY times its largest value, or
-#: _IN_NOISE standard deviations of its noise, whichever is larger.
-_WRONG_WAY, _IN_NOISE = 0.25, 6.0
-
-
-def _another_course(path: str, kind: str, time: np.ndarray, values: np.ndarray, given: tuple) -> list[str]:
-    """Check that a modulus does not rise, and a compliance does not fall, under a constant load. Return notes.
-
-    A running median removes single wrong rows. `given`: duration of the ramp [s], first fitted time [s].
-
-    Raises:
-        InputError: the check fails; the message has the time and possible causes.
-    """
-    from scipy.ndimage import median_filter
-
-    ramp, start = given
-    rows = (time > 0) & (time >= start) & np.isfinite(values)
-    t, v = time[rows], values[rows] * np.sign(np.sum(values[rows]))
-    if len(t) < 8:
-        return []
-    smooth = median_filter(v, size=5, mode="nearest")
-    noise, v = max(noise_of_series(v), 1.4826 * float(np.median(np.abs(v - smooth)))), smooth
-    size = float(v.max())
-    allowed = max(_WRONG_WAY * size, _IN_NOISE * noise)
-    if kind == "creep":
-        fallen = np.maximum.accumulate(v) - v
-        if fallen.max() > allowed:
-            last = t[int(np.argmax(v[: int(np.argmax(fallen > allowed)) + 1]))]
-            raise InputError(
-                f"{path}: the compliance falls from {last:.3g} s on. If the stress was removed, give strain and stress "
-                "in two columns, or end the rows there. If the strain oscillates after loading, exclude these rows "
-                "(--min-time)"
-            )
-        return []
-    peak = int(np.argmax(v))
-    if not ramp and v[peak] - v[: peak + 1].min() > allowed:
-        raise InputError(
-            f"{path}: the modulus rises until {t[peak]:.3g} s, but after a step of strain the modulus can only fall. "
-            f"If the strain rose until then, give --ramp {t[peak]:.3g}; otherwise exclude the earlier rows (--min-time "
-            f"{t[peak]:.3g})"
-        )
-    if ramp and t[0] < 0.3 * ramp and v[0] > 0.7 * size:
-        return [
-            f"the modulus has {100 * v[0] / size:.0f} % of its largest value at {t[0]:.3g} s, but a ramp of {ramp:g} s "
-            f"has only {100 * t[0] / ramp:.2g} % of its strain at this time: check --ramp"
-        ]
-    return []
-
-
-def _ringing(time: np.ndarray, stress: np.ndarray, strain: np.ndarray, start: float) -> list[str]:
-    """Return a note if the strain falls and rises again under constant stress. The inertia of the instrument causes
-    such oscillations."""
-    from scipy.ndimage import median_filter
-
-    largest = float(stress[np.argmax(np.abs(stress))])
-    held = (stress * np.sign(largest) > (1 - HELD) * abs(largest)) & (time >= start)
-    first = int(np.argmax(held))
-    length = int(np.argmin(np.append(held[first:], False)))
-    t, v = time[first : first + length], np.abs(strain[first : first + length])
-    if len(t) < 8:
-        return []
-    noise, v = noise_of_series(v), median_filter(v, size=3, mode="nearest")
-    falls = np.maximum.accumulate(v) - v
-    allowed = max(_RINGS * float(v.max()), _IN_NOISE * noise)
-    if not falls.max() > allowed:
-        return []
-    worst = int(np.argmax(falls))
-    rises = float(v[worst:].max() - v[worst])
-    if not rises > allowed:
-        return []
-    return [
-        f"the strain falls by {100 * falls[worst] / v.max():.2g} % until {t[worst]:.3g} s under a constant stress, and "
-        "rises again. This is an oscillation of the instrument's inertia, not creep: exclude these rows (--min-time)"
-    ]
-
-
-#: The strain oscillates if it falls, and rises again, by more than this fraction of the largest strain.
-_RINGS = 0.02
 
 
 def _as_shear(path, form, columns, sample):
@@ -518,7 +410,7 @@ def _of_one_row_at_rest(test: TimeTest, size: float) -> list[str]:
     here, load = float(test.answer[k]), abs(float(test.driven[k])) / float(np.max(np.abs(test.driven)))
     noise = noise_of_series(test.answer[np.isfinite(test.answer) & (test.time > test.begun)])
     # In a steady cycle, the first response is not 0, because it lags behind the load.
-    if test.cyclic or load > AT_REST or not abs(here) > max(_IN_NOISE * noise, (OFFSET + 2 * load) * size):
+    if test.cyclic or load > AT_REST or not abs(here) > max(BEYOND_NOISE * noise, (OFFSET + 2 * load) * size):
         return []
     what, unit = ("stress", " Pa") if test.kind == "relaxation" else ("strain", "")
     return [

@@ -22,8 +22,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.ndimage
 
+from fitting.readers.checks.scattering_load import without_scatter
 from fitting.readers.noise_of_series import noise_of_series
-from fitting.readers.scattering_load import without_scatter
 from fitting.readers.tables.time_columns import read_columns
 from fitting.readers.time_tests import TimeTest, from_rest, of_columns, with_known_rise
 from fitting.rigs import glued, thin_layer
