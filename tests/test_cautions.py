@@ -15,8 +15,9 @@ from liverjax.core.struct import replace
 from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.physics.contact.pressed import PressedObstacle
 from liverjax.scenes.checks.choices import check_choices
-from liverjax.simulation import cautions
-from liverjax.simulation.cautions import cautions_of_mesh, cautions_of_run, mesh_sentence
+from liverjax.simulation.cautions import of_contacts, of_mesh
+from liverjax.simulation.cautions.of_mesh import cautions_of_mesh, mesh_sentence
+from liverjax.simulation.cautions.of_run import cautions_of_run
 from liverjax.simulation.mesh_error import MeshError
 from liverjax.simulation.run import Result
 from liverjax.waves.cautions import cautions_of_waves
@@ -45,11 +46,11 @@ def test_a_failed_run_with_a_sharp_cone_names_its_tip():
         for code in (status.STALLED, status.CONVERGED)
     )
     pressed = replace(scene(mesh), physics=(cone,))
-    assert "obstacle.0 is a cone with a sharp tip" in cautions._of_sharp_cones(pressed, failed)[0]
-    assert not cautions._of_sharp_cones(pressed, ended)
+    assert "obstacle.0 is a cone with a sharp tip" in of_contacts.of_sharp_cones(pressed, failed)[0]
+    assert not of_contacts.of_sharp_cones(pressed, ended)
     round_tip = replace(pressed, physics=(replace(cone, radius=1e-3),))
-    assert not cautions._of_sharp_cones(round_tip, failed)
-    assert not cautions._of_sharp_cones(replace(pressed, mesh=BOX), failed)
+    assert not of_contacts.of_sharp_cones(round_tip, failed)
+    assert not of_contacts.of_sharp_cones(replace(pressed, mesh=BOX), failed)
 
 
 def test_a_sound_run_has_none():
@@ -426,10 +427,10 @@ def test_quadratic_elements_that_cannot_have_pressures_are_told_that_they_lock()
     """With volumetric = "auto" nothing was said. With "element" the advice was a setting that is refused here."""
     stiff = replace(scene(lj.quadratic(BOX), volumetric="auto"), law=lj.laws.NeoHookean(mu=770.0, bulk=770000.0))
     viscosity = lj.Prony(ratios=jnp.array([0.3]), relaxation_times=jnp.array([0.1]))
-    assert cautions.of_locking(stiff) == []  # "auto" chooses "mixed"
+    assert of_mesh.of_locking(stiff) == []  # "auto" chooses "mixed"
     for volumetric in ("auto", "element"):
         viscous = replace(stiff, viscosity=viscosity, solve=lj.Solve(volumetric=volumetric))
-        (said,) = cautions.of_locking(viscous)
+        (said,) = of_mesh.of_locking(viscous)
         assert said.endswith("write volumetric = 'mixed' in [solve] and part = 'isochoric' in [viscosity]")
     followed = replace(viscosity, part="isochoric")
     check_choices(replace(stiff, viscosity=followed, solve=lj.Solve(volumetric="mixed")))
@@ -437,9 +438,9 @@ def test_quadratic_elements_that_cannot_have_pressures_are_told_that_they_lock()
     waves = replace(
         stiff, springpots=springpots, solve=lj.Solve(kind="harmonic", frequencies=[60.0], volumetric="auto")
     )
-    assert cautions.of_locking(waves)[0].endswith("part = 'isochoric' in [springpots]")
+    assert of_mesh.of_locking(waves)[0].endswith("part = 'isochoric' in [springpots]")
     continued = replace(stiff, law=lj.laws.continued(stiff.law, 0.1))
-    assert cautions.of_locking(continued)[0].endswith("too stiff: use a finer mesh")
+    assert of_mesh.of_locking(continued)[0].endswith("too stiff: use a finer mesh")
 
 
 def test_the_locking_warning_uses_the_moduli_of_each_region():
@@ -448,7 +449,7 @@ def test_the_locking_warning_uses_the_moduli_of_each_region():
     E = soft.mesh.number_of_elements
     half, stiff = np.arange(E // 2), replace(soft.law, bulk=1e6)
     for law in ({"bulk": 1e6}, stiff):
-        (said,) = cautions.of_locking(replace(soft, region=(lj.Region(elements=half, law=law),)))
+        (said,) = of_mesh.of_locking(replace(soft, region=(lj.Region(elements=half, law=law),)))
         assert said.startswith("the bulk modulus is 1e+03 times the shear modulus")
     covered = replace(soft, law=stiff, region=(lj.Region(elements=np.arange(E), law=soft.law),))
-    assert cautions.of_locking(soft) == cautions.of_locking(covered) == []
+    assert of_mesh.of_locking(soft) == of_mesh.of_locking(covered) == []

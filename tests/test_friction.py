@@ -17,7 +17,7 @@ from liverjax.physics.base import Free, Step
 from liverjax.physics.contact.friction import RoughObstacle
 from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.scenes.scene_file import scene_from
-from liverjax.simulation import cautions
+from liverjax.simulation.cautions import of_contacts, of_run
 from liverjax.solvers import attached
 
 pytestmark = pytest.mark.quick_to_compile
@@ -83,17 +83,17 @@ def test_at_rest_the_plane_carries_the_weight(order):
     assert np.allclose(lj.obstacle_forces(scene, result).force[0, -1], weight, atol=1e-8 * G)
     slides = lj.simulate(lj.with_parameters(scene, {"obstacle.0.friction": 0.3}))
     assert slides.status[-1] != status.CONVERGED
-    assert any("only friction prevents sliding of the body" in said for said in cautions.cautions_of_run(scene, slides))
-    assert not any("only friction" in said for said in cautions.cautions_of_run(scene, result))
+    assert any("only friction prevents sliding of the body" in said for said in of_run.cautions_of_run(scene, slides))
+    assert not any("only friction" in said for said in of_run.cautions_of_run(scene, result))
 
 
 def test_a_failed_run_of_a_body_that_only_friction_holds_says_so():
     scene, failed = block(0.5), SimpleNamespace(statistics=SimpleNamespace(status=np.array([status.NOT_FINITE])))
-    assert "[[fixed]]" in cautions._of_friction_alone(scene, failed)[0]
+    assert "[[fixed]]" in of_contacts.of_friction_alone(scene, failed)[0]
     held = replace(scene, fixed=(lj.Fixed(nodes=scene.mesh.node_sets["x_min"]),))
-    assert cautions._of_friction_alone(held, failed) == []
+    assert of_contacts.of_friction_alone(held, failed) == []
     moving = replace(scene, solve=lj.Solve(kind="dynamic", dt=DT))
-    assert cautions._of_friction_alone(moving, failed) == []
+    assert of_contacts.of_friction_alone(moving, failed) == []
 
 
 @pytest.mark.parametrize("order", [1, 2])

@@ -10,7 +10,7 @@ import pytest
 import scipy.optimize
 
 from fitting.__main__ import main
-from fitting.fits import instrument, simulated_rheometer, viscoelastic
+from fitting.fits import compressed_sample, instrument, simulated_rheometer, viscoelastic
 from fitting.fits.families import models
 from fitting.fits.honesty import moduli_errors
 from fitting.methods import generalised_maxwell, uncertainty
@@ -70,8 +70,8 @@ def test_the_number_of_modes_is_chosen_again_with_the_error_of_the_inertia():
     assert [row["modes"] for row in fit.details["modes_tried"]] == [1, 2, 3]
     # A compressed sample keeps the factors of its compression, with the same modes.
     factors = compression.shares(laws.typical("neo_hookean"), 0.2)
-    squeezed, _ = instrument.without_error_of_inertia(instrument.of_compressed_sample(chosen, s, factors), s)
-    same = instrument.of_compressed_sample(fit, s, factors)
+    squeezed, _ = instrument.without_error_of_inertia(compressed_sample.of_compressed_sample(chosen, s, factors), s)
+    same = compressed_sample.of_compressed_sample(fit, s, factors)
     assert np.allclose(squeezed.uncertainty.values, same.uncertainty.values, rtol=1e-6)
 
 
@@ -138,7 +138,7 @@ def test_the_other_models_are_fitted_again_after_a_correction():
     dense = generalised_maxwell.spectrum(s)
     chosen = models.choose(s, "auto", viscoelastic.closed_form(s, 2, dense), dense)
     factors = compression.shares(laws.typical("neo_hookean"), 0.2)
-    at_rest = instrument.of_compressed_sample(chosen, s, factors)
+    at_rest = compressed_sample.of_compressed_sample(chosen, s, factors)
     fit, better = instrument.without_error_of_inertia(at_rest, s, factors)
     told = fit.details["instrument"]
     assert abs(told["inertia_off_by"] - 0.03) < 2 * told["standard_error"] < 0.03 and better is not s
@@ -146,7 +146,7 @@ def test_the_other_models_are_fitted_again_after_a_correction():
     rows = {row["model"]: row["information_criterion"] for row in fit.details["models_compared"]}
     spectrum = models.spectrum_fit(better)
     assert np.isclose(rows["spectrum"], viscoelastic.information_criterion(spectrum))
-    same = instrument.of_compressed_sample(spectrum, better, factors)
+    same = compressed_sample.of_compressed_sample(spectrum, better, factors)
     assert np.isclose(fit.rivals[-1].model.shear_modulus, same.model.shear_modulus)
     assert 0.01 < moduli_errors.model_weights(fit)["spectrum"] < 0.5
 

@@ -13,7 +13,7 @@ from liverjax.jobs import long_run
 from liverjax.physics.attached.ligament import Ligament
 from liverjax.physics.elastic_support import ElasticSupport
 from liverjax.simulation import mesh_error
-from liverjax.simulation.cautions import mesh_sentence
+from liverjax.simulation.cautions.of_mesh import mesh_sentence
 
 pytestmark = pytest.mark.quick_to_compile
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fitting.__main__ import main
-from fitting.fits import instrument, viscoelastic
+from fitting.fits import compressed_sample, instrument, viscoelastic
 from fitting.fits.families import models
 from fitting.fits.honesty import moduli_errors
 from fitting.methods import generalised_maxwell
@@ -107,7 +107,7 @@ def test_factors_of_a_compressed_sample_that_change_nothing_keep_the_errors():
     """The errors for independent noise replaced the errors for the noise that the residuals show."""
     s = repeated(0)
     fit = viscoelastic.closed_form(s, 1)
-    same = instrument.of_compressed_sample(fit, s, compression.Shares(1.0, 1.0))
+    same = compressed_sample.of_compressed_sample(fit, s, compression.Shares(1.0, 1.0))
     np.testing.assert_allclose(same.uncertainty.standard_errors, fit.uncertainty.standard_errors, rtol=1e-6)
 
 
@@ -117,7 +117,7 @@ def test_the_ratio_of_a_compressed_fluid_with_one_mode_is_exactly_one():
     storage, loss = generalised_maxwell.moduli(model, OMEGA)
     s = measured(storage + 1j * loss, 1)
     fit = viscoelastic.modes_from(s, np.log([[700.0, 0.3]]), viscoelastic.FLUID)
-    at_rest = instrument.of_compressed_sample(fit, s, compression.Shares(1.1, 0.9))
+    at_rest = compressed_sample.of_compressed_sample(fit, s, compression.Shares(1.1, 0.9))
     assert at_rest.uncertainty.values[1] == 1 and at_rest.uncertainty.standard_errors[1] == 0
     assert not any("ratios[0]" in told for told in at_rest.warnings)
     np.testing.assert_allclose(at_rest.uncertainty.values[0], fit.uncertainty.values[0] / 1.1)

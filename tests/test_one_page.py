@@ -6,7 +6,7 @@ import pytest
 from conftest import ROOT
 
 from fitting.__main__ import main
-from fitting.fits import instrument, viscoelastic
+from fitting.fits import compressed_sample, viscoelastic
 from fitting.fits.simulated_rheometer import Simulation
 from fitting.readers import rheometer
 from fitting.reports import one_page, sweep_report
@@ -38,7 +38,7 @@ def test_no_line_is_wider_than_the_page():
     """The lines for a compressed sample were cut off at the edge."""
     sweep = rheometer.read_sweep(ROOT / "data" / "lions_mane_frequency_sweep.csv")
     fit = viscoelastic.closed_form(sweep, 3)
-    fit.details["precompression"] = instrument.compression_numbers(fit, Simulation(precompression=0.1))
+    fit.details["precompression"] = compressed_sample.compression_numbers(fit, Simulation(precompression=0.1))
     content = sweep_report.summary(fit, sweep) | {"notes": [], "versions": versions()}
     lines = one_page.text_of_page(sweep, [fit], content)
     assert max(map(len, lines)) <= one_page.CHARACTERS

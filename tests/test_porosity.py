@@ -11,7 +11,8 @@ from liverjax.physics import darcy, porosity
 from liverjax.physics.base import Step
 from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene_file import scene_from
-from liverjax.simulation.cautions import cautions_of_run, of_drained_layer
+from liverjax.simulation.cautions.of_pressures import of_drained_layer
+from liverjax.simulation.cautions.of_run import cautions_of_run
 from liverjax.simulation.equations import initial_state
 from liverjax.tensors.matrices import deformation_gradient
 from liverjax.waves.cautions import cautions_of_waves

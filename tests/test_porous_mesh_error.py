@@ -17,7 +17,7 @@ from liverjax.physics.darcy import unknown_pressures
 from liverjax.physics.elastic_support import ElasticSupport
 from liverjax.physics.porosity import Inlet, inflow
 from liverjax.scenes.refined import can_be_refined, on_refined_mesh
-from liverjax.simulation.cautions import mesh_sentence
+from liverjax.simulation.cautions.of_mesh import mesh_sentence
 from liverjax.simulation.equations import forces_at
 from liverjax.simulation.run import prepared
 

@@ -9,7 +9,7 @@ import pytest
 
 import liverjax as lj
 from fitting import __main__ as command
-from fitting.fits import instrument, viscoelastic
+from fitting.fits import compressed_sample, viscoelastic
 from fitting.fits.families import models
 from fitting.fits.honesty.long_times import INTERVAL
 from fitting.fits.simulated_rheometer import Simulation, rig_of
@@ -45,7 +45,7 @@ def test_warnings_about_the_modes_of_a_compressed_sample_have_its_moduli_at_rest
     poor = fit._replace(details=fit.details | {"conversion": {"modes": 7, "largest_relative_error": 0.05}})
     before = poor._replace(warnings=tuple(models.sentences_of_modes(poor)))
     assert before.warnings[0].startswith(coarse)
-    found = instrument.of_compressed_sample(before, sweep, compression.shares(law, 0.25))
+    found = compressed_sample.of_compressed_sample(before, sweep, compression.shares(law, 0.25))
     told = [w for w in found.warnings if "Prony modes" in w]
     assert len(told) == 2 and not any(w.startswith(coarse) for w in told)
     assert any(f"instantaneous modulus of the 7 Prony modes is {found.model.shear_modulus:.4g} Pa" in w for w in told)
@@ -291,8 +291,8 @@ def test_the_axial_force_is_that_of_the_fitted_model(law):
     G *= 1 + 0.001 * np.random.default_rng(0).standard_normal(25)
     sweep = Sweep(omega, G.real, G.imag)
     (zener,) = (f for f in models.fractional(sweep) if f.kind.name == "fractional_zener")
-    fit = instrument.of_compressed_sample(zener, sweep, factors)
-    told = instrument.compression_numbers(fit, simulation)
+    fit = compressed_sample.of_compressed_sample(zener, sweep, factors)
+    told = compressed_sample.compression_numbers(fit, simulation)
     rest, at_once = (float(v) for v in (fit.parameters.values[0], fit.parameters.values[:2].sum()))
     assert rest == pytest.approx(400, rel=0.05) and fit.model.equilibrium_modulus > 1.2 * rest
     assert told["axial_force_N"] == pytest.approx(one_Pa * rest, rel=1e-9)
@@ -312,13 +312,13 @@ def test_a_compressed_fluid_has_no_axial_force_after_relaxation(law):
     sweep = Sweep(omega, *generalised_maxwell.moduli(fluid, omega))
     fit = models.fluid(sweep, generalised_maxwell.spectrum(sweep))
     fit.details[INTERVAL] = {"low": 0.0, "high": 1.96, "wider_than_standard_error": False}
-    told = instrument.compression_numbers(fit, simulation)
+    told = compressed_sample.compression_numbers(fit, simulation)
     one_Pa = compression.smooth_force(law, STRAIN, 0.01) / float(law.shear_modulus())
     assert told["axial_force_N"] == 0 and told["axial_force_total_error_N"] == pytest.approx(one_Pa)
     assert told["axial_force_at_once_N"] == pytest.approx(1000 * one_Pa, rel=1e-6)
     G = 300 * (1j * omega) ** 0.3
     springpot = models.fractional(Sweep(omega, G.real, G.imag))[0]
-    told = instrument.compression_numbers(springpot, simulation)
+    told = compressed_sample.compression_numbers(springpot, simulation)
     assert told["axial_force_N"] == 0 and told["axial_force_at_once_N"] is None
     springpot.details["precompression"] = told
     assert sweep_report._compression([springpot])[1].endswith(": 0 N (smooth plates)")
@@ -332,7 +332,7 @@ def test_the_force_of_prony_modes_that_add_up_to_a_fluid_has_a_finite_error(law)
     fit = viscoelastic.closed_form(Sweep(omega, storage, loss), 2)
     assert fit.kind.name == "prony" and np.isinf(uncertainty.equilibrium_error(fit.uncertainty))
     fit.details[INTERVAL] = {"low": 0.0, "high": 1.96, "wider_than_standard_error": False}
-    fit.details["precompression"] = told = instrument.compression_numbers(fit, Simulation(precompression=STRAIN))
+    fit.details["precompression"] = told = compressed_sample.compression_numbers(fit, Simulation(precompression=STRAIN))
     one_Pa = compression.smooth_force(law, STRAIN, 0.01) / float(law.shear_modulus())
     assert told["axial_force_standard_error_N"] is None
     assert told["axial_force_total_error_N"] == pytest.approx(one_Pa)

@@ -15,8 +15,9 @@ from liverjax.physics.base import Step
 from liverjax.physics.contact.obstacle import Obstacle, contact_force, largest_depth
 from liverjax.physics.contact.pressed import PressedObstacle
 from liverjax.scenes.scene_file import scene_from
-from liverjax.simulation import cautions, run
-from liverjax.simulation.cautions import cautions_of_run
+from liverjax.simulation import run
+from liverjax.simulation.cautions import of_contacts
+from liverjax.simulation.cautions.of_run import cautions_of_run
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -268,4 +269,4 @@ def test_a_body_with_a_given_loaded_shape_is_unloaded_only_once():
     result = SimpleNamespace(positions=scene.mesh.points[None], times=np.ones(1))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run, "unload", None)  # a call would fail
-        assert cautions._of_contacts(replace(scene, points_are="loaded"), result) == []
+        assert of_contacts.of_obstacles(replace(scene, points_are="loaded"), result) == []

@@ -409,7 +409,7 @@ def _closed(options: argparse.Namespace, sweep: "Sweep", dense: "Spectrum") -> "
 def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sweep"]:
     """Return a list of fits and the corrected sweep. The list contains the closed-form fit and, by default, the fit of
     the simulation."""
-    from fitting.fits import instrument, sample_inertia, viscoelastic
+    from fitting.fits import compressed_sample, instrument, sample_inertia, viscoelastic
     from fitting.fits.honesty import edges, total_error
     from fitting.methods import generalised_maxwell
     from fitting.readers import frequency_sweep
@@ -428,7 +428,7 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
     factors = None
     if options.precompression:
         factors = compression.shares(laws.typical(options.law), options.precompression)
-        closed = instrument.of_compressed_sample(closed, sweep, factors)
+        closed = compressed_sample.of_compressed_sample(closed, sweep, factors)
     if options.friction_error:
         sweep = frequency_sweep.with_friction(sweep, options.friction_error, simulation.radius, simulation.height)
     closed, corrected = instrument.without_error_of_inertia(closed, sweep, factors)
@@ -448,7 +448,7 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
     for fit in fits:
         fit.details["geometry_error"] = total_error.of_geometry(simulation, options.gap_error)
     for fit in fits if options.precompression else ():  # `compression_numbers` uses `geometry_error`
-        fit.details["precompression"] = instrument.compression_numbers(fit, simulation)
+        fit.details["precompression"] = compressed_sample.compression_numbers(fit, simulation)
     return fits, corrected
 
 

@@ -1,5 +1,4 @@
-"""Errors of the instrument that are common to all points of a fit (inertia, friction, gap), each with a prior. This
-module also contains the fit of a compressed sample.
+"""Errors of the instrument that are common to all points of a fit (inertia, friction, gap), each with a prior.
 
 The instrument subtracts the torque of its inertia I; the modulus is the torque per angle, divided by the constant K of
 the geometry. If the true inertia is I (1 + delta), G' is too small by delta I omega^2 / K at the angular frequency
@@ -15,19 +14,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitting.fits import simulated_rheometer, viscoelastic
+from fitting.fits import compressed_sample, viscoelastic
 from fitting.fits.families import models
-from fitting.fits.honesty import total_error
 from fitting.fits.honesty.edges import HALF_DECADE
-from fitting.fits.honesty.long_times import INTERVAL, NORMAL
-from fitting.fits.viscoelastic import Fit, Kind
-from fitting.methods import as_prony_modes, generalised_maxwell, host, uncertainty
+from fitting.fits.viscoelastic import Fit
+from fitting.methods import generalised_maxwell, host, uncertainty
 from fitting.methods.estimate import Estimate, wider
-from fitting.methods.generalised_maxwell import Maxwell, weighed
 from fitting.readers import raw_torque
 from fitting.readers.frequency_sweep import Sweep, some
 from fitting.rigs import compression
-from liverjax import laws
 
 #: If the standard error of an instrument error, divided by its prior standard deviation, is at least this value, the
 #: data do not determine the instrument error.
@@ -147,7 +142,7 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep, factors: compression.Shares
     refitted = models.compared_again(
         refitted._replace(uncertainty=spread),
         corrected,
-        lambda other: other if factors is None else of_compressed_sample(other, corrected, factors),
+        lambda other: other if factors is None else compressed_sample.of_compressed_sample(other, corrected, factors),
     )
     return refitted._replace(run_time=fit.run_time + time.perf_counter() - begin), corrected
 
@@ -404,111 +399,3 @@ def with_gap_error(fit: Fit, relative: float) -> Fit:
         own = wider(own, np.where(moduli, relative * own.values, 0.0))
     details = fit.details | {"gap_error": relative}
     return fit._replace(uncertainty=wider(fit.uncertainty, relative * first), parameters=own, details=details)
-
-
-def of_compressed_sample(fit: Fit, sweep: Sweep, factors: compression.Shares) -> Fit:
-    """Return the closed-form fit of a compressed sample, with the parameters of the sample at rest (not compressed).
-
-    Storage modulus, loss modulus and residuals of the fit still describe the compressed sample.
-
-    Args:
-        fit: fit of the measured moduli. If parameters of the model are moduli, these parameters are also divided by the
-            factors.
-        sweep: the measured moduli.
-        factors: factors by which the compression changes the relaxing and the equilibrium moduli.
-    """
-    kind, details = _kind_at_rest(fit.kind, factors), fit.details
-    if kind.moduli is not None:
-        kind, details = _of_own_moduli(kind, fit, sweep)
-    data = (2 * len(fit.storage), sweep.noise_given)
-    spread, own = viscoelastic.estimates(fit.solution, kind, data, fit.noise_root)
-    modes = len(spread.values) // 2
-    model = Maxwell(spread.values[0], spread.values[1 : modes + 1], spread.values[modes + 1 :])
-    rivals = tuple(of_compressed_sample(other, sweep, factors) for other in fit.rivals)
-    found = fit._replace(model=model, kind=kind, uncertainty=spread, parameters=own, details=details, rivals=rivals)
-    old, new = (_of_parameters(of, sweep) for of in (fit, found))
-    return found._replace(warnings=(*(w for w in fit.warnings if w not in old), *new))
-
-
-def _of_parameters(fit: Fit, sweep: Sweep) -> list[str]:
-    """Return the warnings of a fit that contain values of its parameters or of the Prony modes that represent it."""
-    if fit.parameters is None:
-        return uncertainty.cautions(sweep, fit.uncertainty, fit.kind.name)
-    return models.sentences_of_modes(fit)
-
-
-def _kind_at_rest(kind: Kind, factors: compression.Shares) -> Kind:
-    """Return the kind (the meaning of the variables u) for the sample at rest. The relaxing moduli and the equilibrium
-    modulus are divided by their factors."""
-    seen, shown, moduli = kind.maxwell, kind.values, kind.moduli
-    if shown is None or moduli is None:
-        return kind._replace(maxwell=lambda u: weighed(seen(u), 1 / factors.relaxing, 1 / factors.equilibrium))
-    each = [1 / (factors.equilibrium if n == "equilibrium_modulus" else factors.relaxing) for n in kind.names]
-    each = [f if unit.startswith("Pa") else 1.0 for f, unit in zip(each, kind.units, strict=True)]
-    solid = kind.names[0] == "equilibrium_modulus"
-
-    def at_rest(u, omega):
-        stands = shown(u)[..., :1] if solid else 0.0
-        storage, loss = moduli(u, omega)
-        return (storage - stands) / factors.relaxing + stands / factors.equilibrium, loss / factors.relaxing
-
-    return kind._replace(values=lambda u: np.asarray(each) * shown(u), moduli=at_rest)
-
-
-def _of_own_moduli(kind: Kind, fit: Fit, sweep: Sweep) -> tuple[Kind, dict[str, object]]:
-    """Return the kind and the details with new Prony modes for the model of the sample at rest. The modes of the
-    measured moduli cannot be used, because each of these modes contains a relaxing and an equilibrium part."""
-    own, omega = kind.moduli, sweep.angular_frequency
-    assert own is not None
-    solid = kind.names[0] == "equilibrium_modulus"
-    made = as_prony_modes.convert(lambda w: own(fit.solution.u, w), omega[0], omega[-1], solid)
-    told = {"modes": len(made.times), "largest_relative_error": made.error}
-    kind = kind._replace(maxwell=lambda u: as_prony_modes.modes(made, own(u, made.omega)))
-    return kind, fit.details | {"conversion": told}
-
-
-def compression_numbers(fit: Fit, simulation: simulated_rheometer.Simulation) -> dict[str, object]:
-    """Return the entry `precompression` of fit.json, for a fit in closed form or through the simulation. The forces
-    belong to the fitted model, not to its Prony modes. If its instantaneous modulus is infinite, the force at once is
-    None."""
-    law, strain = laws.typical(simulation.law), simulation.precompression
-    G, glued = float(np.asarray(law.shear_modulus())), fit.method != "closed-form"
-    factors, kept = compression.shares(law, strain), compression.incompressible(law, strain)
-    force = fit.details["force_of_law_N"] if glued else compression.smooth_force(law, strain, simulation.radius)
-    moduli, (noise, total) = models.limiting_moduli(fit), _equilibrium_errors(fit)
-    rest, at_once = moduli["equilibrium_modulus"], moduli.get("shear_modulus")
-    of_mesh = fit.details.get("force_of_law_mesh_bias_N", 0.0) * rest / G
-    return {
-        "strain": strain,
-        "height_at_rest_m": simulation.height / (1 - strain),
-        "plates": "glued" if glued else "smooth",
-        "law": simulation.law,
-        "bulk_over_shear_modulus": float(np.asarray(law.bulk_modulus())) / G,
-        "modulus_if_incompressible": None if glued or kept is None else _changed(fit, factors, kept),
-        "smooth_factor_of_relaxing_moduli": factors.relaxing,
-        "smooth_factor_of_equilibrium_modulus": factors.equilibrium,
-        "axial_force_N": force * rest / G,
-        "axial_force_standard_error_N": None if noise is None else force * noise / G,
-        "axial_force_mesh_bias_N": of_mesh,
-        "axial_force_total_error_N": None if total is None else float(np.hypot(force * total / G, of_mesh)),
-        "axial_force_at_once_N": None if at_once is None else force * at_once / G,
-    }
-
-
-def _equilibrium_errors(fit: Fit) -> tuple[float | None, float | None]:
-    """Return the standard error and the total error [Pa] of the equilibrium modulus; None: unknown. The total error of
-    a fluid is the upper end of the 95 % interval, converted to a standard deviation."""
-    total, interval = total_error.total_errors(fit).get("equilibrium_modulus"), fit.details.get(INTERVAL)
-    if total is None or (interval and not np.isfinite(total)):
-        return None, interval["high"] / NORMAL if interval else None
-    if fit.parameters is None:
-        return uncertainty.equilibrium_error(fit.uncertainty), total
-    return float(fit.parameters.standard_errors[fit.kind.names.index("equilibrium_modulus")]), total
-
-
-def _changed(fit: Fit, before: compression.Shares, after: compression.Shares) -> float:
-    """Return G0 computed with the factors `after`, divided by G0 computed with the factors `before`, for the same
-    measured moduli. If the model has no finite G0, the result is valid for G0 of the Prony modes."""
-    moduli = {"shear_modulus": float(fit.model.shear_modulus)} | models.limiting_moduli(fit)
-    stands = moduli["equilibrium_modulus"] / moduli["shear_modulus"]
-    return (1 - stands) * before.relaxing / after.relaxing + stands * before.equilibrium / after.equilibrium

@@ -58,7 +58,7 @@ def run(options: argparse.Namespace) -> int:
     from liverjax.core.struct import replace
     from liverjax.jobs import fields, long_run, output
     from liverjax.scenes import scene_file
-    from liverjax.simulation.cautions import cautions_of_run
+    from liverjax.simulation.cautions.of_run import cautions_of_run
     from liverjax.simulation.run import unloaded
 
     scene, text = scene_file.load_scene(options.scene), options.scene.read_text(encoding="utf-8-sig")
@@ -199,7 +199,7 @@ def _write_and_tell(given: tuple["Scene", str, list[str]], ran: "Ran", target: P
     from liverjax.jobs import output
     from liverjax.physics import porosity
     from liverjax.scenes.by_element import by_element
-    from liverjax.simulation.cautions import mesh_sentence
+    from liverjax.simulation.cautions.of_mesh import mesh_sentence
 
     scene, text, said = given
     attributes = {"scene": text, "run_time_s": ran.run_time, "compile_time_s": ran.compile_time}

@@ -60,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
 
     from liverjax.core import status
     from liverjax.jobs import sweep
-    from liverjax.simulation.cautions import cautions_of_mesh
+    from liverjax.simulation.cautions.of_mesh import cautions_of_mesh
 
     stored, probes, numbers = tuple(options.store), tuple(options.probe), tuple(options.rows)
     table = sweep.read_sweep(options.scene, options.parameters, stored, probes, options.chunk, numbers)

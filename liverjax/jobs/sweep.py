@@ -40,7 +40,7 @@ from liverjax.scenes.scene_checks import check_physics
 from liverjax.scenes.scene_file import load_scene
 from liverjax.simulation.automatic import with_solver
 from liverjax.simulation.batch import simulate_batch
-from liverjax.simulation.cautions import LEAST_J, MOST_J
+from liverjax.simulation.cautions.of_run import LEAST_J, MOST_J
 
 #: Name of an output that can be stored for every run -> function of the result and the reference positions (V, 3) [m].
 OUTPUTS: dict[str, Callable] = {

@@ -9,7 +9,8 @@ from liverjax.physics.attached.ligament import Ligament
 from liverjax.physics.contact.obstacle import Obstacle, touches_without_pressure
 from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene import Scene, named_physics
-from liverjax.simulation.cautions import cautions_of_mesh, of_drained_layer, of_locking
+from liverjax.simulation.cautions.of_mesh import cautions_of_mesh, of_locking
+from liverjax.simulation.cautions.of_pressures import of_drained_layer
 from liverjax.waves.harmonic import relative_moduli
 
 #: Minimum number of element edges per wavelength of a shear wave. With fewer edges, even quadratic elements cannot

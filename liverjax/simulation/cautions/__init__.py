@@ -1,0 +1,1 @@
+"""Warnings about a run: mesh, contacts, pressures, volumes."""
