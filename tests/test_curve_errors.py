@@ -8,6 +8,7 @@ from test_curves import KNOWN, synthetic
 
 import liverjax as lj
 from fitting.fits import stress_stretch
+from fitting.fits.families import compared_laws
 from fitting.fits.honesty.wrong_columns import structured_curves
 from fitting.methods.estimate import covering_root, spread
 from fitting.methods.noise.uneven_noise import growing_root, uneven_root
@@ -206,9 +207,9 @@ def test_laws_that_tie_are_named_with_their_moduli():
     other, far = (
         best._replace(aicc=best.aicc + d, label=n, shear_modulus=m) for d, n, m in ((2, "b", 900.0), (9, "c", 5.0))
     )
-    (told,) = stress_stretch.tied_laws([best, other, far], "curves")
+    (told,) = compared_laws.tied_laws([best, other, far], "curves")
     assert told.startswith("b fits the curves as well as neo_hookean does") and "with G0 from 7" in told
-    assert "to 900 Pa" in told and not stress_stretch.tied_laws([best, far], "curves")
+    assert "to 900 Pa" in told and not compared_laws.tied_laws([best, far], "curves")
 
 
 @pytest.mark.ci
@@ -223,7 +224,7 @@ def test_soft_samples_have_no_larger_weight():
     assert np.isclose(found.values[0], 1000.0, rtol=2e-3)
     # The errors of the table are relative to the measured stress.
     assert np.isclose(found.curve_errors["0"], 1000 / 700 - 1, rtol=0.02)
-    told = stress_stretch.unfollowed(same, [found])
+    told = compared_laws.unfollowed(same, [found])
     assert told[0].startswith(
         "0: the stress is 0.7 times that of neo_hookean, with the same course. If this is not another"
     )
@@ -241,11 +242,11 @@ def test_laws_with_too_many_parameters_for_the_points_are_told():
     )
     ordered = curves_report.best_first([far, near, best])
     assert [f.label for f in ordered] == ["neo_hookean", "near", "far"]
-    (told,) = stress_stretch.too_few_points(ordered, 4)
+    (told,) = compared_laws.too_few_points(ordered, 4)
     assert told.startswith("4 points are too few to compare laws with 2 or more parameters by AICc, so neo_hookean")
-    assert "20 %, although near has 0.1 %" in told and not stress_stretch.too_few_points([best, far], 4)
+    assert "20 %, although near has 0.1 %" in told and not compared_laws.too_few_points([best, far], 4)
     exact = near._replace(values=np.ones(4))
-    assert not stress_stretch.too_few_points([best, exact], 4)
+    assert not compared_laws.too_few_points([best, exact], 4)
 
 
 def test_a_factor_of_a_test_is_no_misfit_of_the_law():

@@ -15,7 +15,7 @@ from conftest import COMPILED
 import liverjax as lj
 from fitting.__main__ import main
 from fitting.fits import stress_stretch
-from fitting.fits.families import hyperelastic
+from fitting.fits.families import compared_laws, hyperelastic
 from fitting.readers import curves
 from fitting.reports import curves_report
 from liverjax.laws import homogeneous
@@ -228,7 +228,7 @@ def test_a_curve_that_no_law_follows_is_named():
     tension, shear, _ = synthetic(KNOWN["neo_hookean"])
     foreign = shear._replace(stress=3 * shear.stress, label="another unit")
     found = stress_stretch.fit(candidate, [tension, tension._replace(label="again"), foreign])
-    (sentence,) = stress_stretch.unfollowed([tension, tension._replace(label="again"), foreign], [found])
+    (sentence,) = compared_laws.unfollowed([tension, tension._replace(label="again"), foreign], [found])
     assert sentence.startswith(
         "another unit: no law fits this curve. The nearest law (neo_hookean) misses the curve by"
     )

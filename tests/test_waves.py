@@ -205,7 +205,7 @@ def test_changes_over_a_slope_are_those_of_a_linear_field():
     body = voxels.voxel_body(np.ones((7, 7, 9), bool), spacing)
     a = np.array([3.0, -2.0, 5.0 + 1j])
     field = np.asarray(body.linear.points) @ a + 7
-    slopes = stiffness_map._changes_over_slopes(body, stiffness_map._mean_of_corners(body), 0.005)
+    slopes = voxels.changes_over_slopes(body, voxels.mean_of_corners(body), 0.005)
     for D, expected in zip(slopes, a * [0.005, 0.005, 0.006], strict=True):
         np.testing.assert_allclose(D @ field, expected, rtol=1e-9)
 

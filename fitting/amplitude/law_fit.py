@@ -12,8 +12,9 @@ import numpy as np
 
 from fitting.amplitude import cycle
 from fitting.amplitude.strain_sweep import StrainSweep
+from fitting.fits.families.compared_laws import tied_laws
 from fitting.fits.families.hyperelastic import Candidate
-from fitting.fits.stress_stretch import STARTS, LawFit, assessed, tied_laws
+from fitting.fits.stress_stretch import STARTS, LawFit, assessed
 from fitting.methods.generalised_maxwell import Maxwell, moduli
 from fitting.methods.least_squares import levenberg_marquardt
 from fitting.readers.curves import Curve

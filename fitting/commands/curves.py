@@ -40,7 +40,7 @@ def run(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from fitting.fits import stress_stretch
-    from fitting.fits.families import hyperelastic
+    from fitting.fits.families import compared_laws, hyperelastic
     from fitting.fits.honesty.wrong_columns import structured_curves
     from fitting.readers import curves
     from fitting.reports import curves_report
@@ -71,9 +71,9 @@ def run(options: argparse.Namespace) -> int:
         for sentence in fit.warnings:
             print(f"warning: {fit.label}: {sentence}", file=sys.stderr)
     ordered = curves_report.best_first(fits)
-    tied = stress_stretch.tied_laws(ordered, "curves")
-    tied += stress_stretch.too_few_points(ordered, sum(len(c.stress) for c in found))
-    told = (*stress_stretch.unfollowed(found, fits), *stress_stretch.loaded_at_rest(found), *structured, *tied)
+    tied = compared_laws.tied_laws(ordered, "curves")
+    tied += compared_laws.too_few_points(ordered, sum(len(c.stress) for c in found))
+    told = (*compared_laws.unfollowed(found, fits), *stress_stretch.loaded_at_rest(found), *structured, *tied)
     for sentence in told:
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"written: {options.out}/curves.json, curves.png")

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from fitting.fits.stress_stretch import LawFit, loaded_at_rest, unfollowed
+from fitting.fits.families.compared_laws import unfollowed
+from fitting.fits.stress_stretch import LawFit, loaded_at_rest
 from fitting.readers.curves import Curve
 from fitting.reports.sweep_report import numbers
 from liverjax.core.files import write_whole

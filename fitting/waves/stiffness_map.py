@@ -44,7 +44,7 @@ from fitting.waves import balance
 from fitting.waves.balance import Balanced, Matrices
 from fitting.waves.correlated_noise import correlation
 from fitting.waves.regions import MeasuredWaves
-from fitting.waves.voxels import VoxelBody
+from fitting.waves.voxels import VoxelBody, changes_over_slopes, mean_around_corners, mean_of_corners
 from liverjax.core.errors import InputError
 from liverjax.core.files import mark_of, refuse_other, whole
 from liverjax.core.struct import Content
@@ -190,11 +190,11 @@ def course_of(body: VoxelBody, m: Matrices, waves: MeasuredWaves, whole: np.ndar
         whole: complex modulus of the whole organ at each frequency (F,) [Pa].
         length: correlation length of the prior [m].
     """
-    mean, p, number = _mean_of_corners(body), smooth.prior(body.whole, length), len(whole)
+    mean, p, number = mean_of_corners(body), smooth.prior(body.whole, length), len(whole)
     levels = np.eye(number) if number > 1 else np.zeros((1, 0))
     every = np.ones((mean.shape[0], 1))
     exponents = tuple(scipy.sparse.hstack([mean, scipy.sparse.csr_array(every * own)], "csr") for own in levels)
-    slopes, once = _changes_over_slopes(body, mean, length), _mean_around(body, mean) @ mean
+    slopes, once = changes_over_slopes(body, mean, length), mean_around_corners(body, mean) @ mean
     shown = (2 * once - once @ once).tocsr()
     return Course(m, waves, np.asarray(whole, complex), exponents, slopes, shown, p, length, body.voxel)
 
@@ -264,40 +264,6 @@ def _with_place(sd: np.ndarray, slopes: np.ndarray) -> np.ndarray:
     """Add the uncertainty of positions (module docstring) to standard deviations `sd` (F, P), and return the result.
     `slopes` (3, P): changes of c over the width w."""
     return np.sqrt(sd**2 + np.sum(slopes**2, axis=0) / 12)
-
-
-def _mean_of_corners(body: VoxelBody) -> scipy.sparse.csr_array:
-    tets = np.asarray(body.whole.tetrahedra)
-    rows = np.repeat(np.arange(len(tets)), 4)
-    shape = (len(tets), body.whole.number_of_nodes)
-    return scipy.sparse.csr_array((np.full(rows.size, 0.25), (rows, tets.ravel())), shape=shape)
-
-
-def _mean_around(body: VoxelBody, mean: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
-    """Return the matrix (P, E) of the means over the elements around each corner, weighted by volume."""
-    volumes = np.asarray(body.whole.volumes)
-    return (scipy.sparse.diags_array(1 / (mean.T @ volumes)) @ mean.T @ scipy.sparse.diags_array(volumes)).tocsr()
-
-
-def _changes_over_slopes(
-    body: VoxelBody, mean: scipy.sparse.csr_array, length: float
-) -> tuple[scipy.sparse.csr_array, ...]:
-    """Return one matrix (P, P) for each axis: its product with a nodal field is the change of the field over the width
-    w. The width w is `length` [m], or the side of a brick if the side is longer.
-
-    The gradient at a corner is the mean over the elements around this corner, weighted by volume.
-    """
-    tets = np.asarray(body.whole.tetrahedra)
-    D = np.moveaxis(np.asarray(body.whole.shape_vectors), -1, 0)
-    gradients = np.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)  # (E, 4, 3)
-    over = np.maximum(np.ptp(np.asarray(body.whole.points)[tets[0]], axis=0), length)
-    rows, columns = np.repeat(np.arange(len(tets)), 4), tets.ravel()
-    of_elements = [
-        scipy.sparse.csr_array((w * gradients[:, :, a].ravel(), (rows, columns)), shape=mean.shape)
-        for a, w in enumerate(over)
-    ]
-    around = _mean_around(body, mean)
-    return tuple((around @ own).tocsr() for own in of_elements)
 
 
 def _reached(course: Course, z: np.ndarray, k: int) -> _Reached:

@@ -5,6 +5,7 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
+import scipy.sparse
 
 from liverjax.core.errors import InputError
 from liverjax.mesh.promotion import quadratic
@@ -149,3 +150,38 @@ def on_all_nodes(body: VoxelBody, corners: np.ndarray) -> np.ndarray:
     for middle, (i, j) in zip(nodes[4:], PAIRS, strict=True):
         values[middle] = 0.5 * (values[nodes[i]] + values[nodes[j]])
     return values
+
+
+def mean_of_corners(body: VoxelBody) -> scipy.sparse.csr_array:
+    """Return the matrix (E, P) of the means over the four corners of each element."""
+    tets = np.asarray(body.whole.tetrahedra)
+    rows = np.repeat(np.arange(len(tets)), 4)
+    shape = (len(tets), body.whole.number_of_nodes)
+    return scipy.sparse.csr_array((np.full(rows.size, 0.25), (rows, tets.ravel())), shape=shape)
+
+
+def mean_around_corners(body: VoxelBody, mean: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
+    """Return the matrix (P, E) of the means over the elements around each corner, weighted by volume."""
+    volumes = np.asarray(body.whole.volumes)
+    return (scipy.sparse.diags_array(1 / (mean.T @ volumes)) @ mean.T @ scipy.sparse.diags_array(volumes)).tocsr()
+
+
+def changes_over_slopes(
+    body: VoxelBody, mean: scipy.sparse.csr_array, length: float
+) -> tuple[scipy.sparse.csr_array, ...]:
+    """Return one matrix (P, P) for each axis: its product with a nodal field is the change of the field over the width
+    w. The width w is `length` [m], or the side of a brick if the side is longer.
+
+    The gradient at a corner is the mean over the elements around this corner, weighted by volume.
+    """
+    tets = np.asarray(body.whole.tetrahedra)
+    D = np.moveaxis(np.asarray(body.whole.shape_vectors), -1, 0)
+    gradients = np.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)  # (E, 4, 3)
+    over = np.maximum(np.ptp(np.asarray(body.whole.points)[tets[0]], axis=0), length)
+    rows, columns = np.repeat(np.arange(len(tets)), 4), tets.ravel()
+    of_elements = [
+        scipy.sparse.csr_array((w * gradients[:, :, a].ravel(), (rows, columns)), shape=mean.shape)
+        for a, w in enumerate(over)
+    ]
+    around = mean_around_corners(body, mean)
+    return tuple((around @ own).tocsr() for own in of_elements)
