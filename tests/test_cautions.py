@@ -12,6 +12,7 @@ import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.core import status
 from liverjax.core.struct import replace
+from liverjax.mesh.locate import doubled_vertices
 from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.physics.contact.pressed import PressedObstacle
 from liverjax.scenes.checks.choices import check_choices
@@ -136,7 +137,21 @@ def test_short_bodies_and_nodes_in_one_place():
     x, tets = np.asarray(BOX.points), np.asarray(BOX.tetrahedra)
     two = lj.tet_mesh(np.concatenate([x, x + np.array([0.1, 0, 0])]), np.concatenate([tets, tets + len(x)]))
     (found,) = cautions_of_run(scene(two), run(two, [np.eye(3)], [1.0]))
-    assert found.startswith("4 nodes have the same coordinates as another node, so the body is not connected there")
+    assert found.startswith(
+        "4 nodes have the same coordinates as another node, up to roundoff, so the body is not connected there"
+    )
+
+
+@pytest.mark.parametrize("shift", [1e-9, 1.5e-8, 8e-7, "float32"])
+def test_nodes_in_nearly_one_place_are_told(shift):
+    """Vertices that were apart by the roundoff of a file were neither doubled nor hanging."""
+    x, tets = np.asarray(BOX.points), np.asarray(BOX.tetrahedra)
+    moved = x + np.array([0.21, 0, 0])
+    moved = moved.astype(np.float32) if shift == "float32" else moved + np.array([shift, 0, 0])
+    both = np.concatenate([x + np.array([0.11, 0, 0]), moved])
+    assert doubled_vertices(lj.tet_mesh(both, np.concatenate([tets, tets + len(x)]))) == 4
+    fine = lj.shapes.cylinder(0.01, 0.004, 0.0025)
+    assert doubled_vertices(lj.tet_mesh(np.asarray(fine.points) + 1e3, fine.tetrahedra)) == 0  # far from the origin
 
 
 @pytest.mark.parametrize("cells", [(2, 2, 2), (1, 2, 2), (3, 3, 3), (1, 1, 1)])

@@ -155,7 +155,22 @@ def test_the_progress_of_an_earlier_map_does_not_stay(tmp_path, monkeypatch, cap
 
 def test_scenes_of_two_orders_have_different_meshes(tmp_path):
     """The scenes have as many elements, but not as many nodes. NumPy ended with a traceback."""
-    scenes = [_scene(tmp_path)]
-    scenes.append(replace(scenes[0], mesh=lj.quadratic(scenes[0].mesh)))
+    first = _scene(tmp_path)
+    _refused_as_other_mesh(first, lj.quadratic(first.mesh))
+
+
+def _refused_as_other_mesh(first, mesh):
+    scenes = first, replace(first, mesh=mesh)
     with pytest.raises(lj.InputError, match="use one mesh in all scenes"):
-        field.start_of(scene_numbers.Problem(tuple(scenes), ()), "law.mu")
+        field.start_of(scene_numbers.Problem(scenes, ()), "law.mu")
+
+
+def test_scenes_with_other_nodes_or_other_elements_have_different_meshes(tmp_path):
+    """36 elements each, but 24 and 28 nodes: NumPy ended with a traceback. With the same nodes and the elements in
+    another order, each element got the modulus of another element.
+    """
+    first, size = _scene(tmp_path), (0.06, 0.04, 0.04)
+    a, b = lj.shapes.box(size, (3, 2, 1)), lj.shapes.box(size, (6, 1, 1))
+    assert a.number_of_elements == b.number_of_elements and a.number_of_nodes != b.number_of_nodes
+    _refused_as_other_mesh(replace(first, mesh=a), b)
+    _refused_as_other_mesh(first, lj.tet_mesh(first.mesh.points, np.asarray(first.mesh.tetrahedra)[::-1]))

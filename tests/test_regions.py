@@ -10,6 +10,7 @@ import pytest
 
 import liverjax as lj
 from liverjax.core.struct import replace
+from liverjax.mesh.locate import elements_at
 from liverjax.scenes.by_element import law_of_elements
 from liverjax.scenes.regions import select_elements
 from liverjax.scenes.scene import numbers_at, with_parameters
@@ -177,6 +178,22 @@ def test_bounds_on_the_surface_or_outside_of_the_body_are_not_told():
             assert len(select_elements(mesh, where, None))
     with pytest.warns(UserWarning, match="x_min = 0.001 cuts elements"):
         select_elements(mesh, {"x_min": 0.001, "y_min": -1.0}, None)
+
+
+def test_bounds_and_points_on_a_face_are_found_in_single_precision():
+    """The tolerance was 1e-9 of the size: rounded nodes were not on the bound, without a warning. A point on the face
+    was refused.
+    """
+    exact = lj.shapes.box((0.2, 0.1, 0.12), (10, 5, 6))
+    rounded = lj.tet_mesh(np.asarray(exact.points).astype(np.float32), exact.tetrahedra)
+    for where in ({"z_min": 0.06, "x_max": 0.0}, {"z_min": 0.12}, {"z_max": 0.06, "y_max": 0.02}):
+        assert np.array_equal(lj.boundary.select(exact, where), lj.boundary.select(rounded, where))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(select_elements(rounded, {"z_min": 0.06}, None)) == 900
+    elements_at(rounded, np.array([[0.1, 0.05, 0.12], [0.2, 0.1, 0.12]]), "points")
+    with pytest.raises(lj.InputError, match="outside the body"):
+        elements_at(rounded, np.array([[0.1, 0.05, 0.12001]]), "points")
 
 
 @pytest.mark.slow

@@ -1,19 +1,22 @@
 """The command for waves: tables, maps that continue, one-line messages for invalid input."""
 
 import json
+from types import SimpleNamespace
 
 import h5py
+import meshio
 import numpy as np
 import pytest
 from test_waves import DENSITY, HERTZ, H, modulus, organ, plane_waves
 
 from fitting import __main__ as command
 from fitting.readers import rheometer
-from fitting.reports.waves import report
+from fitting.reports.waves import maps, report
 from fitting.waves import (
     balance,
     elastography,
     stiffness_map,
+    wave_field,
 )
 from liverjax.core.errors import InputError
 
@@ -70,6 +73,34 @@ def test_the_command_writes_regions_and_a_map_and_goes_on(tmp_path, capsys):
     again = json.loads((tmp_path / "out" / "waves.json").read_text())
     assert again["map"]["chi2_per_component"] <= 1.001 * first["map"]["chi2_per_component"]
     assert "map: chi2" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+@pytest.mark.parametrize("axes", [np.diag([-2.0, 2.0, 2.0]), np.array([[0, 0, 2.0], [-2.0, 0, 0], [0, 2.0, 0]])])
+def test_the_map_lies_where_the_affine_of_the_image_says(axes, stride, tmp_path):
+    """The body began at the origin of the affine, but extended along x, y and z, so it was mirrored or turned."""
+    nibabel, shape = pytest.importorskip("nibabel"), (10, 6, 8)
+    affine = np.eye(4)
+    affine[:3, :3], affine[:3, 3] = axes, (90, -60, -30)
+    U = np.moveaxis(plane_waves(shape).displacement, 0, 3).astype(np.complex64)
+    nibabel.save(nibabel.Nifti1Image(U, affine), tmp_path / "w.nii")
+    field = wave_field.read_waves(tmp_path / "w.nii", list(HERTZ))._replace(noise=np.full(2, 1e-7))
+    field = wave_field.coarsened(field, stride)
+    body = elastography.body_of(field)
+    organ_of_file = SimpleNamespace(field=field, body=body)
+    moduli = np.full((2, len(body.whole.points)), 3e3 + 1j)
+    maps.write_for_paraview(tmp_path / "m.vtu", organ_of_file, SimpleNamespace(modulus=moduli, sd=moduli))
+    maps.write_at_voxels(tmp_path / "m.h5", organ_of_file, None, np.zeros(1))
+    corners = body.voxel[: len(body.linear.points)]
+    there = 1e-3 * ((corners * stride + 0.5 * (stride - 1)) @ axes.T + affine[:3, 3])
+    mesh = meshio.read(tmp_path / "m.vtu")
+    np.testing.assert_allclose(mesh.points, there, atol=1e-9)
+    x = mesh.points[mesh.cells[0].data]
+    assert np.linalg.det(x[:, 1:] - x[:, :1]).min() > 0
+    with h5py.File(tmp_path / "m.h5") as file:
+        place = file["place"][:]
+        np.testing.assert_allclose(corners @ place[:, :3].T + place[:, 3], there, atol=1e-9)
+        np.testing.assert_allclose(file["origin"][:], place[:, 3])
 
 
 @pytest.mark.ci

@@ -417,6 +417,32 @@ def test_labels_that_lie_elsewhere_than_the_waves_are_refused(tmp_path, turned):
     assert np.array_equal(read.labels, labels)
 
 
+def test_a_mask_must_be_near_the_waves_at_every_corner(tmp_path):
+    """Vectors and origin were compared separately: a mask that was turned by 5 degrees was accepted, although its far
+    corner was 11 voxels away. So was a voxel size 0.9 % smaller in an array of 100 voxels.
+    """
+    place = np.array([[0.002, 0, 0, 0], [0, 0.002, 0, 0], [0, 0, 0.002, 0]])
+    nibabel, image = pytest.importorskip("nibabel"), np.ones((100, 90, 5), np.int16)
+
+    def read(angle, size, known=True):
+        affine = np.diag([size, size, 2.0, 1.0])
+        c, s = np.cos(angle), np.sin(angle)
+        affine[:2, :2] = size * np.array([[c, -s], [s, c]])
+        nibabel.save(nibabel.Nifti1Image(image, affine), tmp_path / "m.nii")
+        return wave_field._on_the_same_voxels(
+            tmp_path / "m.nii", "mask", np.full(3, 0.002), place if known else None, False
+        )
+
+    assert read(0.0, 2.0).shape == (100, 90, 5) and read(5e-4, 2.0).all() and read(0.0, 1.995, known=False).all()
+    for angle in (np.deg2rad(5), 2e-3):
+        with pytest.raises(InputError, match="the voxels are not at the positions of the voxels of the waves"):
+            read(angle, 2.0)
+    with pytest.raises(InputError, match="the voxel size is"):
+        read(0.0, 1.982, known=False)
+    image = np.ones((4, 5), np.int16)  # the shape is refused later
+    assert read(0.0, 2.0).shape == (4, 5)
+
+
 def test_arrays_of_nearly_known_names_are_told(tmp_path):
     """A mask of a wrong name was ignored without a word."""
     field = plane_waves((5, 5, 5))

@@ -1,5 +1,6 @@
 """Read complex displacements of a harmonic motion on voxels from files."""
 
+import itertools
 import os
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,6 +29,8 @@ class WaveField(NamedTuple):
     noise: np.ndarray  # (F,) [m] standard deviation of the noise in real and imaginary part of one component
     source: str = ""
     notes: tuple[str, ...] = ()
+    #: Position of the voxels in space (3, 4) [m], as `formats.PLACE`. None: the axes of the voxels are x, y and z.
+    place: np.ndarray | None = None
 
 
 def read_waves(
@@ -89,7 +92,15 @@ def read_waves(
     regions = _whole_numbers(name, "labels", found.get("labels"), shape)
     order = np.argsort(hertz)
     field = WaveField(hertz[order], U[order], step, origin, inside, regions, np.zeros(len(U)), name, tuple(notes))
-    return field._replace(noise=noise_of(field))
+    return field._replace(noise=noise_of(field), place=_with_lengths(place, step, origin))
+
+
+def _with_lengths(place: np.ndarray | None, step: np.ndarray, origin: np.ndarray) -> np.ndarray | None:
+    """Return the position of the voxels in space (3, 4) [m], with the directions of `place` and the spacing `step`."""
+    if place is None:
+        return None
+    axes = place[:, :3]
+    return np.column_stack([axes / np.linalg.norm(axes, axis=0) * step, origin])
 
 
 def _of_replaced(name: str, found: Content, step: np.ndarray, unit: str | None) -> list[str]:
@@ -120,8 +131,10 @@ def _on_the_same_voxels(file: Path, key: str, spacing: np.ndarray, place: object
     `place`: position in space of the voxels of the waves (see `formats.PLACE`); None if the position is unknown.
     """
     values, own, elsewhere = formats.single(file, key, spacing_given)
+    number = np.maximum((*values.shape, 1, 1, 1)[:3], 1)  # of voxels along the axes; the shape is checked later
     if elsewhere is not None and place is not None:
-        apart = np.abs(np.asarray(elsewhere) - np.asarray(place)).max()
+        corners = np.array([(*at, 1) for at in itertools.product(*((0, n - 1) for n in number))])
+        apart = np.linalg.norm(corners @ (np.asarray(elsewhere) - np.asarray(place)).T, axis=1).max()
         if apart > SAME_PLACE * float(np.min(spacing)):
             raise InputError(
                 f"{file}: the voxels are not at the positions of the voxels of the waves, or the axes have different "
@@ -129,7 +142,7 @@ def _on_the_same_voxels(file: Path, key: str, spacing: np.ndarray, place: object
             )
     if own is not None:
         size = _lengths(str(file), "spacing", own, "its spacing")
-        if not np.allclose(size, spacing, rtol=0.01):
+        if np.any(np.abs(size / spacing - 1) > np.minimum(SAME_SIZE, HALF / number)):
             raise InputError(
                 f"{file}: the voxel size is {size.tolist()} m, but the waves have voxels of {spacing.tolist()} m; give "
                 f"{key} on the voxels of the waves"
@@ -139,6 +152,9 @@ def _on_the_same_voxels(file: Path, key: str, spacing: np.ndarray, place: object
 
 #: Two positions are regarded as equal if they differ by less than this (in voxels).
 SAME_PLACE = 0.1
+#: Two voxel sizes are regarded as equal if their relative difference is below `SAME_SIZE`, and if it changes the length
+#: of the whole array by less than `HALF` a voxel.
+SAME_SIZE, HALF = 0.01, 0.5
 #: Components that are exactly 0 are reported if they occur in less than this fraction of the voxels.
 FEW = 0.2
 
@@ -397,12 +413,17 @@ def coarsened(field: WaveField, stride: int) -> WaveField:
         mask[None, ..., None], field.displacement[(slice(None), *cut)].reshape(-1, *blocks, 3).mean((2, 4, 6)), np.nan
     )
     labels = None if field.labels is None else _most_frequent(field.labels[cut], stride, blocks)
+    place, middle = field.place, 0.5 * (stride - 1)  # centre of the first block, in voxels
+    if place is not None:
+        first = place[:, 3] + middle * place[:, :3].sum(axis=1)
+        place = np.column_stack([place[:, :3] * stride, first])
     return field._replace(
+        place=place,
         displacement=U,
         mask=mask,
         labels=labels,
         spacing=field.spacing * stride,
-        origin=field.origin + 0.5 * (stride - 1) * field.spacing,
+        origin=field.origin + middle * field.spacing if place is None else place[:, 3],
         noise=field.noise / stride**1.5,
     )
 

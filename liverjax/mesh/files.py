@@ -17,7 +17,7 @@ from liverjax.core.struct import replace
 from liverjax.mesh.adjacency import PAIRS, node_numbers
 from liverjax.mesh.formats.abaqus import read_abaqus
 from liverjax.mesh.promotion import quadratic
-from liverjax.mesh.tetrahedra import UNITS, TetMesh, check_mesh, tet_mesh
+from liverjax.mesh.tetrahedra import SIX_DIGITS, UNITS, TetMesh, check_mesh, tet_mesh
 
 if TYPE_CHECKING:
     import meshio
@@ -27,9 +27,10 @@ CELLS = {1: "tetra", 2: "tetra10"}
 _NAMES = {1: "linear", 2: "quadratic"}
 #: Edges of a quadratic element in the order of VTK and meshio.
 _VTK = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
-#: An edge counts as curved if the distance between its midside node and its middle is above this fraction of its
-#: length.
-_STRAIGHT = 1e-6
+#: An edge counts as curved if the distance between its midside node and its middle is above the fraction `_STRAIGHT` of
+#: its length. If the roundoff of coordinates with six digits (`SIX_DIGITS`) is above this limit, it is the new limit,
+#: but at most the fraction `_ROUNDED` of the length.
+_STRAIGHT, _ROUNDED = 1e-6, 1e-2
 
 
 def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
@@ -131,11 +132,16 @@ def _with_middles(points: np.ndarray, tets: np.ndarray, node_sets: dict, element
     low, high = np.asarray(mesh.pattern.edges)
     length = np.linalg.norm(straight[high] - straight[low], axis=1)[middles - len(used)]
     off = np.linalg.norm(points[of_file] - straight[middles], axis=2)
-    curved = of_file[off > _STRAIGHT * length]
-    if len(curved) and _permuted(points[of_file], straight[middles], length):
+    curved = of_file[off > np.clip(SIX_DIGITS * np.abs(points).max(), _STRAIGHT * length, _ROUNDED * length)]
+    if len(curved) and _permuted(points[of_file], straight[middles]):
         raise InputError(
-            f"{name}: the middle nodes of the elements are not in the order of the file format (each lies on another "
-            "edge of its element); export the mesh again, as VTU or Gmsh"
+            f"{name}: the middle nodes of the elements are not in the order of the file format (they lie on other "
+            "edges of their elements); export the mesh again, as VTU or Gmsh"
+        )
+    if np.any(new[of_file] != middles):
+        twice = of_file[new[of_file] != middles][0]
+        raise InputError(
+            f"{name}: node {twice} is the middle node of two different edges; export the mesh again, as VTU or Gmsh"
         )
     if len(curved):
         warnings.warn(
@@ -148,14 +154,15 @@ def _with_middles(points: np.ndarray, tets: np.ndarray, node_sets: dict, element
     return replace(mesh, node_sets={k: node_numbers(np.unique(v)) for k, v in sets.items()})
 
 
-def _permuted(points: np.ndarray, middles: np.ndarray, length: np.ndarray) -> bool:
+def _permuted(points: np.ndarray, middles: np.ndarray) -> bool:
     """Return whether the points (E, 6, 3) [m] are the edge middles (E, 6, 3) [m] in another order.
 
-    The order must be the same for all elements.
+    This is the case if, at one of the six places in the order, most points are nearer to the middle of another edge of
+    their element.
     """
-    apart = np.linalg.norm(points[:, :, None] - middles[:, None], axis=3)
-    order = apart[0].argmin(axis=1)
-    return bool(np.all(apart[:, np.arange(6), order] <= _STRAIGHT * length[:, order]))
+    apart = [np.linalg.norm(points - middles[:, k : k + 1], axis=2) for k in range(6)]
+    elsewhere = np.argmin(apart, axis=0) != np.arange(6)
+    return bool(np.any(elsewhere.mean(axis=0) > 0.5))
 
 
 #: Pattern at the beginning of a file that meshio cannot read -> kind of the file, and a remedy.

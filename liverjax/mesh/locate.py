@@ -7,16 +7,17 @@ import numpy as np
 from liverjax.core.errors import InputError
 from liverjax.mesh.selection import boundary_triangles
 from liverjax.mesh.shape_functions import functions
-from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.mesh.tetrahedra import OF_AN_EDGE, SIX_DIGITS, TetMesh, roundoff_of
 
 #: A point is in a tetrahedron if all its barycentric coordinates are above minus this number.
 _INSIDE = 1e-9
-#: Two vertices coincide if their distance is below this fraction of the body's size.
+#: Two vertices coincide if their distance is below this fraction of the body's size, or below the roundoff of
+#: coordinates with six digits (`SIX_DIGITS`), but at most the fraction `OF_AN_EDGE` of the shortest edge at both.
 SAME_PLACE = 1e-9
-#: A vertex lies on a face if its distance from the face is below a limit: `_ON_FACE` times the size of the face.
-#: Coordinates with six digits have the relative roundoff `_DIGITS`. If this roundoff is above the limit, it is the new
-#: limit, but at most 100 times the old limit.
-_ON_FACE, _DIGITS = 1e-5, 5e-6
+#: A vertex lies on a face if its distance from the face is below a limit: `_ON_FACE` times the size of the face. If the
+#: roundoff of coordinates with six digits (`SIX_DIGITS`) is above the limit, it is the new limit, but at most 100 times
+#: the old limit.
+_ON_FACE = 1e-5
 #: Maximum number of vertices near a triangle. Only needle-like triangles have more. Such triangles are not searched.
 _MOST_NEAR = 200
 #: A piece of a line is ignored if it is shorter than this fraction of the line.
@@ -33,10 +34,19 @@ class Pieces(NamedTuple):
 
 
 def doubled_vertices(mesh: TetMesh) -> int:
-    """Return the number of vertices that coincide with another vertex. At such vertices, the mesh is not connected."""
-    points = np.asarray(mesh.points)
-    steps = np.rint(points[: mesh.number_of_vertices] / (SAME_PLACE * float(np.ptp(points, axis=0).max())))
-    return mesh.number_of_vertices - len(np.unique(steps, axis=0))
+    """Return the number of vertices that coincide with another vertex, up to the roundoff of their coordinates. At such
+    vertices, the mesh is not connected."""
+    from scipy.spatial import cKDTree  # slow to import
+
+    points, (low, high) = np.asarray(mesh.points), np.asarray(mesh.pattern.edges)
+    length, shortest = np.linalg.norm(points[high] - points[low], axis=1), np.full(mesh.number_of_vertices, np.inf)
+    for end in (low, high):
+        np.minimum.at(shortest, end, length)
+    least = SAME_PLACE * float(np.ptp(points, axis=0).max())
+    near = np.maximum(least, np.minimum(SIX_DIGITS * np.abs(points).max(), OF_AN_EDGE * shortest))  # for each vertex
+    pairs = cKDTree(points[: mesh.number_of_vertices]).query_pairs(near.max(), output_type="ndarray")
+    apart = np.linalg.norm(points[pairs[:, 1]] - points[pairs[:, 0]], axis=1)
+    return len(np.unique(pairs[apart <= near[pairs].min(axis=1), 1]))
 
 
 def hanging_vertices(mesh: TetMesh) -> int:
@@ -55,7 +65,7 @@ def hanging_vertices(mesh: TetMesh) -> int:
         near = tree.query_ball_point(middles[chunk], radii[chunk])
         pair = np.repeat(chunk, [len(one) for one in near])
         vertex = vertices[np.concatenate([*near, []]).astype(int)]
-        away = np.clip(_DIGITS * np.abs(points).max() / radii[pair], _ON_FACE, 100 * _ON_FACE)
+        away = np.clip(SIX_DIGITS * np.abs(points).max() / radii[pair], _ON_FACE, 100 * _ON_FACE)
         found.append(vertex[_on_triangle(points[vertex], corners[pair], away)])
     return len(np.unique(np.concatenate(found)))
 
@@ -84,14 +94,19 @@ def barycentric(mesh: TetMesh, points: np.ndarray) -> np.ndarray:
 def elements_at(mesh: TetMesh, points: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the elements (n,) that contain points (n, 3) [m], and the barycentric coordinates (4, n) of the points.
 
+    A point on the surface may lie outside of the body by the roundoff of the coordinates (`roundoff_of`).
+
     Raises:
         InputError: a point is outside the mesh.
     """
     L = barycentric(mesh, points)
     least = L.min(axis=0)
     element = least.argmax(axis=1)
-    worst = int(least.max(axis=1).argmin())
-    if least[worst, element[worst]] < -_INSIDE:
+    D = np.asarray(mesh.shape_vectors)[..., element]
+    slope = np.linalg.norm(np.concatenate([D, -D.sum(axis=0, keepdims=True)]), axis=1).max(axis=0)
+    beyond = least.max(axis=1) + np.maximum(_INSIDE, roundoff_of(mesh) * slope)
+    worst = int(beyond.argmin())
+    if beyond[worst] < 0:
         raise InputError(
             f"{name}: the point {points[worst].tolist()} m is outside the body; move this point into the body"
         )

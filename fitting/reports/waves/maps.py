@@ -10,6 +10,7 @@ import numpy as np
 from fitting.waves import voxels
 from fitting.waves.elastography import Organ
 from fitting.waves.stiffness_map import WaveMap, sd_of_modulus
+from fitting.waves.wave_field import WaveField
 from liverjax.core.files import whole
 from liverjax.core.plotting import pyplot
 
@@ -32,6 +33,8 @@ def write_at_voxels(path: Path, organ: Organ, drawn: WaveMap | None, usual: np.n
     with whole(path) as new, h5py.File(new, "w") as file:
         for name in ("frequencies", "spacing", "origin", "mask"):
             file[name] = getattr(organ.field, name)
+        file["place"] = in_space(organ.field)
+        file["place"].attrs["unit"] = "m"
         file["direct_inversion"] = usual
         if drawn is None:
             return
@@ -51,8 +54,19 @@ def write_for_paraview(path: Path, organ: Organ, drawn: WaveMap) -> None:
     for hertz, G, sd in zip(organ.field.frequencies, drawn.modulus, drawn.sd, strict=True):
         data |= {f"storage_{hertz:g}_Hz": G.real, f"loss_{hertz:g}_Hz": G.imag}
         data |= {f"sd_of_logarithm_{hertz:g}_Hz": sd.real, f"sd_of_loss_angle_{hertz:g}_Hz": sd.imag}
-    mesh = organ.body.whole
-    meshio.write_points_cells(path, np.asarray(mesh.points), {"tetra": np.asarray(mesh.tetrahedra)}, data)
+    mesh, field, place = organ.body.whole, organ.field, in_space(organ.field)
+    points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
+    if field.place is not None:
+        points = (points - field.origin) / field.spacing @ place[:, :3].T + place[:, 3]
+    if np.linalg.det(place[:, :3]) < 0:  # the mesh is mirrored: exchange two corners, so that the volumes are positive
+        tets = tets[:, [0, 2, 1, 3]]
+    meshio.write_points_cells(path, points, {"tetra": tets}, data)
+
+
+def in_space(field: WaveField) -> np.ndarray:
+    """Return the position of the voxels in space (3, 4) [m]: the vectors from voxel to voxel along the three axes of
+    the array, then the centre of the first voxel."""
+    return np.column_stack([np.diag(field.spacing), field.origin]) if field.place is None else field.place
 
 
 def maps_picture(organ: Organ, drawn: WaveMap, usual: np.ndarray) -> "Figure":

@@ -83,8 +83,8 @@ def cautions_of_mesh(mesh: TetMesh) -> list[str]:
     doubled = doubled_vertices(mesh)
     if doubled:
         said.append(
-            f"{doubled} nodes have the same coordinates as another node, so the body is not connected there: merge "
-            "these nodes if the body should be connected"
+            f"{doubled} nodes have the same coordinates as another node, up to roundoff, so the body is not connected "
+            "there: merge these nodes if the body should be connected"
         )
     hanging = hanging_vertices(mesh)
     if hanging:
