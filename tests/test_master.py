@@ -231,12 +231,18 @@ def test_given_factors_and_vertical_ones_do_not_go_together(tmp_path):
     data = temperature_sweeps.read_temperatures([tmp_path / "a.csv"])
     (note,) = (n for n in master_curve.master_curve(data, None, vertical=True).sweep.notes if "--vertical" in n)
     assert "the column shift_factor" in note
+    wrong = master_curve._sentences(shifts.known_shifts(data.sweeps, data.temperatures, 0, 0 * TRUE), 0.0, True)
+    assert "or check the column shift_factor" in wrong[1] and "--vertical" not in wrong[1]
     assert not any("--vertical finds" in n for n in master_curve.master_curve(data, None).sweep.notes)
 
 
 @pytest.mark.parametrize(
     ("name", "celsius"),
-    [("Sweep-25C", 25), ("Sweep -25C", -25), ("-25 °C", -25), ("run_-25.5 C", -25.5), ("3-25C", 25)],
+    # The Unicode minus was ignored, and the first number with a C or K was used: 3 °C, and 5 K.
+    [
+        *(("Sweep-25C", 25), ("Sweep -25C", -25), ("-25 °C", -25), ("run_-25.5 C", -25.5), ("3-25C", 25)),
+        *(("\u221225 °C", -25), ("step 3C at 37 °C", 37), ("5 K/min, 25 C", 25), ("run 1C 37 C", None)),
+    ],
 )
 def test_a_hyphen_between_words_is_no_sign(tmp_path, name, celsius):
     tables = [(name, 1.0), ("other 40 C", 2.0)]
@@ -247,6 +253,10 @@ def test_a_hyphen_between_words_is_no_sign(tmp_path, name, celsius):
         for title, m in tables
     )
     (tmp_path / "t.txt").write_text(text)
+    if celsius is None:
+        with pytest.raises(InputError, match=r"states several temperatures \(1 °C, 37 °C\); add a column"):
+            temperature_sweeps.read_temperatures([tmp_path / "t.txt"])
+        return
     data = temperature_sweeps.read_temperatures([tmp_path / "t.txt"])
     assert np.allclose(data.temperatures - 273.15, [celsius, 40])
 
@@ -295,6 +305,34 @@ def test_scattered_temperatures_that_count_as_one_are_told(tmp_path):
     assert "rows from 20.3 to 21.5 °C count as one temperature, 20.9 °C" in data.sweeps[0].notes[-1]
 
 
+def test_a_wrong_reading_of_the_temperature_is_ignored(tmp_path):
+    """One wrong cell made a sweep of one point, and the message advised to remove half of the temperatures."""
+    rows = [f"{f},{1000 + f},{100 + f},{T}" for T in (-10, 20) for f in (1, 2, 3, 4)]
+    rows[-1] = rows[-1].replace(",20", ",31.4")
+    head = "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,temperature_C\n"
+    (tmp_path / "a.csv").write_text(head + "\n".join(rows).replace("-", "\u2212") + "\n")
+    data = temperature_sweeps.read_temperatures([tmp_path / "a.csv"])
+    assert np.allclose(data.temperatures - 273.15, [-10, 20])
+    assert any("the points at 31.4 °C (frequencies: 4 Hz) are ignored" in note for note in data.sweeps[0].notes)
+
+
+def test_the_instrument_is_found_in_each_sweep_before_the_shift(tmp_path):
+    """All points were shifted, also those at which the inertia is 20 % of G'. The band limited shifted frequencies."""
+    omega, rng = np.geomspace(0.5, 300, 16), np.random.default_rng(0)
+    parts = parts_of({0: 0.003, 1: 0.003}, [omega, omega], np.array([0.5, 0.0]))
+    heavy = [s._replace(storage=s.storage + 0.5 * omega**2, source="a.csv") for s in parts]
+    data = temperature_sweeps.AtTemperatures(heavy, TEMPERATURES[:2], None)
+    found = temperature_sweeps.with_usable_points(data, (None, None), None, None)
+    assert all(len(s.storage) < 16 and len(s.storage) + len(s.grey) == 16 for s in found.sweeps)
+    notes = [note for note in found.sweeps[0].notes if "which is the mark of the instrument" in note]
+    assert notes and notes[0].startswith("at -10")
+    limited = temperature_sweeps.with_usable_points(data, (None, 10.0), None, None).sweeps
+    assert all(s.angular_frequency[-1] <= 20 * np.pi < 300 and s.source == "a.csv" for s in limited)
+    # The raw columns, which show the inertia, are kept if tables at one temperature are joined.
+    raw = {"torque": rng.random(16)}
+    assert np.allclose(temperature_sweeps.joined([parts[0]._replace(raw=raw)]).raw["torque"], raw["torque"])
+
+
 @pytest.mark.draws
 def test_the_command_shifts_several_files_and_fits_the_curve(tmp_path, capsys):
     paths = []
@@ -305,7 +343,9 @@ def test_the_command_shifts_several_files_and_fits_the_curve(tmp_path, capsys):
         head = "angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa,Temperature (°C)"
         paths[-1].write_text("\n".join([head, *rows]) + "\n")
     out = tmp_path / "out"
-    assert main([*map(str, paths), "--master", "30", "--model", "spectrum", "--out", str(out)]) == 0
+    assert (
+        main([*map(str, paths), "--master", "30", "--model", "spectrum", "--optimizer", "bfgs", "--out", str(out)]) == 0
+    )
     content = json.loads((out / "fit.json").read_text())
     shift = content["details"]["shift"]
     assert shift["reference_temperature_C"] == pytest.approx(30.0) and len(shift["log10_a"]) == 5
@@ -315,6 +355,7 @@ def test_the_command_shifts_several_files_and_fits_the_curve(tmp_path, capsys):
     table = np.genfromtxt(out / "shift_factors.csv", delimiter=",", names=True)
     assert np.allclose(np.log10(table["shift_factor"]), TRUE[2:7], atol=5e-3)
     told = capsys.readouterr()
+    assert "has no effect" not in told.err and content["data"] == ", ".join(map(str, paths))
     assert "reference" in told.out and "nearest" not in told.err and (out / "shift.png").exists()
 
 

@@ -6,6 +6,7 @@ from conftest import SHARED
 
 from fitting.__main__ import main
 from fitting.fits import viscoelastic
+from fitting.master import master_curve
 from fitting.methods import generalised_maxwell
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.frequency_sweep import Sweep
@@ -47,6 +48,19 @@ def test_errors_of_the_prediction_cover_the_truth():
     # The points of a sweep are correlated: 20 sweeps count, not 500 points.
     assert 0.8 < np.mean(covered) <= 1.0
     assert found.relative_errors[found.inside].mean() < 0.02
+
+
+def test_a_test_at_another_temperature_is_shifted_to_the_reference():
+    """A sweep at 20 °C was predicted at 40 °C without a note. Its error was 15 %."""
+    shift = {"reference_temperature_C": 40.0, "temperatures_C": [20.0, 40.0], "log10_a": [1.0, 0.0]}
+    shift["log10_b"] = [0.1, 0.0]
+    one = sweep(0.0, 0)._replace(source="a.csv")
+    tests = [one._replace(raw={"temperature": np.full(25, 273.15 + T)}) for T in (20.1, 30.0, 41.0)]
+    tests, told = master_curve.at_reference([*tests, relaxation()], shift)
+    assert np.allclose(tests[0].angular_frequency, 10 * OMEGA) and np.allclose(tests[0].loss, 10**0.1 * one.loss)
+    assert told[0].startswith("a.csv: measured at 20.1 °C; its frequencies are multiplied by the shift factor 10")
+    assert told[1].startswith("a.csv: measured at 30 °C, but predicted at 40 °C") and len(told) == 2
+    assert all(np.array_equal(own.angular_frequency, OMEGA) for own in tests[1:3])
 
 
 def test_errors_of_a_sweep_with_deviations_are_relative_to_its_moduli():

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
+from fitting.master.temperature_sweeps import joined
+from fitting.readers.frequency_sweep import Sweep
 from fitting.readers.rheometer import read_sweep
 from liverjax import InputError
 
@@ -273,3 +275,14 @@ def test_any_encoding_is_read(tmp_path, encoding):
     s = read_sweep(tmp_path / "a.csv")
     assert s.storage.tolist() == [1250, 1500, 1750] and s.loss.tolist() == [500, 600, 700]
     assert s.raw is not None and np.allclose(s.raw["temperature"], 293.15)
+
+
+def test_deviations_are_smoothed_in_each_of_several_joined_sweeps():
+    """Deviations of 0.5 and 10 % in two sweeps were smoothed together, and both sweeps had nearly equal weights."""
+    omega, own = np.geomspace(0.5, 80, 12), []
+    for k, error in enumerate((0.005, 0.1)):
+        G = 1000 * omega**0.3, 300 * omega**0.3
+        own.append(Sweep(omega, *G, error * G[0], error * G[1], source=f"{k}.csv", sd_before=True))
+    whole = joined(own)
+    assert np.allclose(whole.deviations[0], whole.storage_sd, rtol=0.01)
+    assert whole.sd_before and not whole.sd_estimated and whole.source == "0.csv, 1.csv"

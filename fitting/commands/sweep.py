@@ -52,8 +52,8 @@ def parser(prog: str) -> argparse.ArgumentParser:
         help="further tests of the same material (relaxation, creep, sweep, shear waves), all fitted together",
     )
     command.add_argument("--table", metavar="NAME", help="number, or part of the name, of the table to read")
-    command.add_argument("--max-frequency", type=float, metavar="HZ", help="ignore the points above this frequency")
-    command.add_argument("--min-frequency", type=float, metavar="HZ", help="ignore the points below this frequency")
+    command.add_argument("--max-frequency", type=float, metavar="HZ", help="ignore points measured above this value")
+    command.add_argument("--min-frequency", type=float, metavar="HZ", help="ignore points measured below this value")
     shared_options.add_modes(command)
     command.add_argument(
         "--model",
@@ -161,10 +161,9 @@ def run(options: argparse.Namespace) -> int:
         return together.run(options)
     options.method = options.method or "torsion"
     shift: Content = {}
-    shifted = ""
     tests = _tests_to_predict(options)  # read now, so that an error in a file does not discard a finished fit
     if options.master is None:
-        sweep = shared_options.usable_sweep(options, options.sweep[0])
+        sweep, shifted = shared_options.usable_sweep(options, options.sweep[0]), ""
     else:
         sweep, shift, shifted = _master(options)
     for note in sweep.notes:
@@ -179,7 +178,7 @@ def run(options: argparse.Namespace) -> int:
     elif options.profile:
         profile = uncertainty.profile_intervals(fits[0].solution, sweep, fits[0].uncertainty)
     posterior = _posterior(options, sweep, fits[-1])
-    predictions = _predictions(tests, sweep, fits[-1])
+    predictions = _predictions(tests, sweep, fits[-1], shift)
     content = sweep_report.write(options.out, sweep, fits, profile, posterior)
     print(sweep_report.table(sweep, fits))
     for told in predictions:
@@ -207,10 +206,11 @@ def run(options: argparse.Namespace) -> int:
 def _master(options: argparse.Namespace) -> tuple["Sweep", dict, str]:
     """Write and print the master curve of the files. Return its sweep, its entry of fit.json, and the printed table."""
     from fitting.master import master_curve, master_report, temperature_sweeps
-    from fitting.readers import rheometer
 
     reference = None if options.master == MIDDLE else options.master + 273.15
     data = temperature_sweeps.read_temperatures(options.sweep)
+    band = options.min_frequency, options.max_frequency
+    data = temperature_sweeps.with_usable_points(data, band, options.radius, options.height)
     found = master_curve.master_curve(data, reference, options.vertical)
     writable(options.out, ("shift_factors.csv", "master_curve.csv", "shift.png"))
     master_report.write_master_curve(options.out, found)
@@ -221,8 +221,7 @@ def _master(options: argparse.Namespace) -> tuple["Sweep", dict, str]:
         nearest = f"the measured temperature nearest to {options.master:g} °C"
         print(f"note: the reference is {at - 273.15:.4g} °C, {nearest}", file=sys.stderr)
     print(f"written: {options.out}/shift_factors.csv, master_curve.csv, shift.png")
-    sweep = rheometer.within(found.sweep, options.min_frequency, options.max_frequency)
-    return sweep, {"shift": master_curve.shift_numbers(found)}, table
+    return found.sweep, {"shift": master_curve.shift_numbers(found)}, table
 
 
 def _tests_to_predict(options: argparse.Namespace) -> list["Measured"]:
@@ -239,13 +238,15 @@ def _tests_to_predict(options: argparse.Namespace) -> list["Measured"]:
     return tests
 
 
-def _predictions(tests: list["Measured"], sweep: "Sweep", fit: "Fit") -> list[str]:
-    """Return a sentence on each test that the fit predicts."""
+def _predictions(tests: list["Measured"], sweep: "Sweep", fit: "Fit", shift: dict) -> list[str]:
+    """Return sentences on each test that the fit predicts. `shift`: the entry of `_master`, or empty."""
     if not tests:
         return []
+    from fitting.master import master_curve
     from fitting.reports import prediction
 
-    return [prediction.sentence(prediction.predict(fit, sweep.resolved, test)) for test in tests]
+    tests, told = master_curve.at_reference(tests, shift["shift"]) if shift else (tests, [])
+    return told + [prediction.sentence(prediction.predict(fit, sweep.resolved, test)) for test in tests]
 
 
 def _check(options: argparse.Namespace) -> None:
@@ -295,7 +296,7 @@ def _note_idle(options: argparse.Namespace) -> None:
     idle["--law"] = options.law != "neo_hookean" and not options.precompression
     for name in (name for name, changed in idle.items() if changed):
         print(f"note: {name} is for the simulation, and has no effect on the closed form", file=sys.stderr)
-    if several and options.optimizer != "levenberg-marquardt":
+    if several and options.master is None and options.optimizer != "levenberg-marquardt":
         print(f"note: --optimizer {options.optimizer} is for a single sweep, and has no effect here", file=sys.stderr)
 
 
@@ -441,7 +442,6 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
         dense = generalised_maxwell.spectrum(corrected)
     fits = [edges.honest(closed, corrected, dense)]
     heavy = {} if options.density is None else {"density_kg_m3": options.density}
-    fits[0].details.update(heavy)
     if options.method != "closed-form":
         fits.append(_simulated(options, corrected, fits[0], simulation.run))
         fits[1].details.update(heavy)

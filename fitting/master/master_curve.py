@@ -1,6 +1,7 @@
 """Compute the master curve of sweeps at several temperatures, and fit laws to its shift factors."""
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import scipy.special
@@ -8,11 +9,15 @@ import scipy.special
 from fitting.master import shifts, temperature_laws
 from fitting.master.shifts import Shifts
 from fitting.master.temperature_laws import TemperatureLaw
-from fitting.master.temperature_sweeps import AtTemperatures, joined
+from fitting.master.temperature_sweeps import SAME, AtTemperatures, joined
 from fitting.readers.frequency_sweep import Sweep, merged, scatter
+from fitting.readers.rheometer import WARMER
 from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
+
+if TYPE_CHECKING:
+    from fitting.fits.together.measured_tests import Measured
 
 #: The program warns if the relative distance of a sweep from the common curve is larger than FAR_OFF, and also larger
 #: than SCATTERS times the scatter of the points. It also warns if the standard error of a shift factor is larger than
@@ -68,20 +73,21 @@ def master_curve(data: AtTemperatures, reference: float | None, vertical: bool =
     parts = [_shifted_sweep(s, a, b) for s, a, b in zip(data.sweeps, found.log_a, found.log_b, strict=True)]
     laws = temperature_laws.temperature_laws_of(found)
     whole = joined(parts)
-    notes = [*whole.notes, *_sentences(found, _scatter_of_points(data.sweeps)), *untold]
+    notes = [*whole.notes, *_sentences(found, _scatter_of_points(data.sweeps), vertical), *untold]
     if vertical and found.given:
         notes.append(
             "--vertical finds no factors of the moduli, because the file gives the factors of the frequencies: remove "
             "the column shift_factor to find both kinds of factors"
         )
-    return MasterCurve(whole._replace(notes=tuple(notes)), parts, found, laws)
+    return MasterCurve(whole._replace(notes=tuple(notes), raw=None), parts, found, laws)
 
 
 def _shifted_sweep(sweep: Sweep, log_a: float, log_b: float) -> Sweep:
     a, b = 10.0**log_a, 10.0**log_b
     moduli: Content = {q: getattr(sweep, q) for q in ("storage", "loss", "storage_sd", "loss_sd")}
     moduli = {q: None if values is None else b * values for q, values in moduli.items()}
-    return sweep._replace(angular_frequency=a * sweep.angular_frequency, **moduli)
+    grey = None if sweep.grey is None else sweep.grey * [a, b, b]
+    return sweep._replace(angular_frequency=a * sweep.angular_frequency, **moduli, grey=grey)
 
 
 def _scatter_of_points(sweeps: list[Sweep]) -> float:
@@ -92,9 +98,9 @@ def _scatter_of_points(sweeps: list[Sweep]) -> float:
     return float(np.median(known)) if known else 0.0
 
 
-def _sentences(found: Shifts, noise: float) -> list[str]:
+def _sentences(found: Shifts, noise: float, vertical: bool) -> list[str]:
     """Return a note about the shifts, and warnings if the shifted sweeps do not lie on one curve or if a shift is
-    uncertain. `noise`: relative scatter of the points."""
+    uncertain. `noise`: relative scatter of the points. `vertical`: whether factors of the moduli are asked for."""
     T = celsius(found.temperatures)
     out = [
         f"{len(T)} sweeps from {T[0]:.4g} to {T[-1]:.4g} °C are shifted to {T[found.reference]:.4g} °C. The root mean "
@@ -104,9 +110,10 @@ def _sentences(found: Shifts, noise: float) -> list[str]:
     if far:
         listed = ", ".join(f"{T[k]:.4g} °C {100 * found.misfit[k]:.2g} %" for k in far[:4])
         more = f" and {len(far) - 4} more" if len(far) > 4 else ""
+        remedy = ", or check the column shift_factor" if found.given else "" if vertical else ", or try --vertical"
         out.append(
             f"superposition is not valid at some temperatures (distance from the common curve: {listed}{more}); remove "
-            "these temperatures, or try --vertical"
+            f"these temperatures{remedy}"
         )
     loose = [k for k in range(len(T)) if found.log_a_errors[k] > LOOSE]
     if loose:
@@ -188,6 +195,32 @@ def _unshown_factors(sweeps: list[Sweep], found: Shifts) -> list[str]:
         "moduli can replace each other. So --vertical does not determine these factors, and their stated errors are "
         "too small: remove --vertical, or measure a wider band"
     ]
+
+
+def at_reference(tests: "Sequence[Measured]", shift: Content) -> "tuple[list[Measured], list[str]]":
+    """Return the tests with the frequencies and moduli that they have at the reference temperature, and a sentence on
+    each test at another temperature. `shift`: `shift_numbers` of the master curve."""
+    out, told, reference = [], [], shift["reference_temperature_C"]
+    for test in tests:
+        raw = test.raw if isinstance(test, Sweep) else None
+        heat = celsius((raw or {}).get("temperature", np.empty(0)))
+        heat = heat[np.isfinite(heat)]
+        T = float(np.mean(heat)) if heat.size else reference
+        near = np.abs(np.array(shift["temperatures_C"]) - T)
+        k = int(np.argmin(near))
+        if max(abs(T - reference), np.ptp([*heat, T])) > WARMER:
+            at = f"{test.source}: measured at {T:.4g} °C"
+            if isinstance(test, Sweep) and near[k] < SAME and np.ptp(heat) <= WARMER:
+                log_a, log_b = (shift[name][k] for name in ("log10_a", "log10_b"))
+                test = _shifted_sweep(test, log_a, log_b)
+                told.append(f"{at}; its frequencies are multiplied by the shift factor {10.0**log_a:.4g}")
+            else:
+                told.append(
+                    f"{at}, but predicted at {reference:.4g} °C, because no sweep at its temperature is fitted: choose "
+                    "a reference temperature near to it, or give such a sweep"
+                )
+        out.append(test)
+    return out, told
 
 
 def shift_numbers(found: MasterCurve) -> Content:

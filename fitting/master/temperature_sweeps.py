@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitting.readers.frequency_sweep import FEWEST, Sweep, some
+from fitting.methods.kramers_kronig import without_instrument
+from fitting.readers.frequency_sweep import FEWEST, Sweep, some, within, without_inertia
 from fitting.readers.rheometer import REPEATED, SORTED, read_all_sweeps
 from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
@@ -18,6 +19,9 @@ from liverjax.core.errors import InputError
 SAME = 1.0
 #: The measured temperatures of a table and the temperature in its name differ by at most this [K].
 OFF_NAME = 5.0
+#: A temperature in the name of a table. A hyphen after a letter or a digit separates words ("Sweep-25C"), so it is not
+#: a minus sign. A value that a slash follows is a rate ("5 K/min").
+_STATED = re.compile(r"((?:(?<![^\W_])-)?\d+(?:[.,]\d+)?)\s*(°?)\s*([CK])\b(?!\s*/)")
 
 
 class AtTemperatures(NamedTuple):
@@ -32,11 +36,12 @@ def read_temperatures(paths: Sequence[Path]) -> AtTemperatures:
     """Read all sweeps of the files, and join the sweeps at the same temperature.
 
     The temperature must be in a column (`temperature_C`, or `Temperature` with its unit) or in the name of the table. A
-    column `shift_factor` may contain shift factors that are already known.
+    column `shift_factor` may contain shift factors that are already known. Without such factors, temperatures with
+    fewer than `FEWEST` frequencies are ignored.
 
     Raises:
-        InputError: a table states no temperature, there are fewer than two temperatures, or a temperature or shift
-            factor is not positive.
+        InputError: a table states no temperature or several, there are fewer than two temperatures, or a temperature
+            or shift factor is not positive.
     """
     parts: list[tuple[float, float, Sweep]] = []
     for path in paths:
@@ -44,12 +49,15 @@ def read_temperatures(paths: Sequence[Path]) -> AtTemperatures:
             parts += _by_temperature(str(path), name, sweep)
     parts.sort(key=lambda part: part[0])
     group = _index_of_group(np.array([part[0] for part in parts]), exact=True)
-    groups = [[parts[k] for k in np.flatnonzero(group == g)] for g in range(group.max() + 1)]
+    groups, ignored = _with_enough_points(
+        [[parts[k] for k in np.flatnonzero(group == g)] for g in range(max(group) + 1)]
+    )
     if len(groups) < 2:
+        also = "".join(f"; {note}" for note in ignored)
         raise InputError(
             f"{paths[0]}: --master needs sweeps at two or more temperatures, but all sweeps are at "
-            f"{celsius(parts[0][0]):.4g} °C (rows less than {SAME:g} K apart count as one temperature); give a file "
-            "with several tables, or several files"
+            f"{celsius(groups[0][0][0]):.4g} °C{also} (rows less than {SAME:g} K apart count as one temperature); give "
+            "a file with several tables, or several files"
         )
     factors = np.array([_mean_factor(np.array([p[1] for p in g])) for g in groups])
     means = np.array([float(np.mean([p[0] for p in g])) for g in groups])
@@ -60,8 +68,56 @@ def read_temperatures(paths: Sequence[Path]) -> AtTemperatures:
             f"the given values of shift_factor are not used, and all factors are fitted, because the factor at "
             f"{without} °C is missing: give a factor at every temperature"
         )
-        sweeps[0] = sweeps[0]._replace(notes=(*sweeps[0].notes, note))
+        ignored = [*ignored, note]
+    sweeps[0] = sweeps[0]._replace(notes=(*sweeps[0].notes, *ignored))
     return AtTemperatures(sweeps, means, factors if known.all() else None)
+
+
+def _with_enough_points(
+    groups: list[list[tuple[float, float, Sweep]]],
+) -> tuple[list[list[tuple[float, float, Sweep]]], list[str]]:
+    """Return the groups (one for each temperature) with `FEWEST` or more frequencies, and a note on each other group.
+
+    One or two points at another temperature are often wrong readings of the temperature, and fewer points do not
+    determine a shift. All groups are returned if no shift is fitted, or if no group has enough frequencies.
+    """
+    omegas = [np.unique(np.concatenate([p[2].angular_frequency for p in own])) for own in groups]
+    few = [len(omega) < FEWEST for omega in omegas]
+    if all(few) or all(np.isfinite([p[1] for p in own]).any() for own in groups):
+        return groups, []
+    notes = []
+    for own, omega in itertools.compress(zip(groups, omegas, strict=True), few):
+        T, hertz = celsius(float(np.mean([p[0] for p in own]))), ", ".join(f"{f:.3g}" for f in omega / (2 * np.pi))
+        notes.append(
+            f"the points at {T:.4g} °C (frequencies: {hertz} Hz) are ignored, because a shift needs {FEWEST} or more "
+            "frequencies at one temperature: check the temperature of these rows"
+        )
+    return [own for own, short in zip(groups, few, strict=True) if not short], notes
+
+
+def with_usable_points(
+    data: AtTemperatures, band: tuple[float | None, float | None], radius: float | None, height: float | None
+) -> AtTemperatures:
+    """Return the data without the points at which the instrument dominates, and without the points outside the band.
+    Notes say which points are ignored, and at which temperatures.
+
+    Args:
+        data: sweeps that are not shifted.
+        band: lowest and highest measured frequency [Hz], or None. If the highest one is given, the points that show the
+            mark of the instrument (`without_instrument`) are kept, as in a fit of one sweep.
+        radius, height: of the sample [m], if they are known.
+    """
+    sweeps, told = [], dict[str, list[str]]()
+    for sweep, T in zip(data.sweeps, celsius(data.temperatures), strict=True):
+        own = within(sweep._replace(source=f"{sweep.source} at {T:.4g} °C", notes=()), *band)
+        own = without_inertia(own, radius, height)
+        own = own if band[1] else without_instrument(own)
+        for note in own.notes:
+            told.setdefault(note, []).append(f"{T:.4g}")
+        sweeps.append(own._replace(source=sweep.source, notes=sweep.notes))
+    notes = [f"at {', '.join(places)} °C: {note}" for note, places in told.items()]
+    sweeps[0] = sweeps[0]._replace(notes=(*sweeps[0].notes, *notes))
+    return data._replace(sweeps=sweeps)
 
 
 def _mean_factor(factors: np.ndarray) -> float:
@@ -87,7 +143,7 @@ def _index_of_group(T: np.ndarray, exact: bool) -> np.ndarray:
 
 def joined(sweeps: Sequence[Sweep]) -> Sweep:
     """Return one sweep with all points of several sweeps, sorted by frequency. It has standard deviations if all
-    sweeps have them."""
+    sweeps have them, and the raw columns that all sweeps have."""
     omega = np.concatenate([s.angular_frequency for s in sweeps])
     order = np.argsort(omega, kind="stable")
     storage, loss = (np.concatenate([getattr(s, q) for s in sweeps])[order] for q in ("storage", "loss"))
@@ -100,8 +156,31 @@ def joined(sweeps: Sequence[Sweep]) -> Sweep:
         storage_sd, loss_sd = (
             np.concatenate([getattr(s, q) for s in sweeps])[order] for q in ("storage_sd", "loss_sd")
         )
-    told = tuple(dict.fromkeys(notes))
-    return Sweep(omega[order], storage, loss, storage_sd, loss_sd, source=sweeps[0].source, notes=told)
+    raws, greys = [s.raw or {} for s in sweeps], [s.grey for s in sweeps if s.grey is not None]
+    return Sweep(
+        omega[order],
+        storage,
+        loss,
+        storage_sd,
+        loss_sd,
+        source=", ".join(dict.fromkeys(s.source for s in sweeps)),
+        notes=tuple(dict.fromkeys(notes)),
+        raw={q: np.concatenate([raw[q] for raw in raws])[order] for q in raws[0] if all(q in raw for raw in raws)}
+        or None,
+        grey=np.concatenate(greys) if greys else None,
+        sd_estimated=all(given) and all(s.sd_estimated for s in sweeps),
+        sd_before=all(given) and all(s.sd_before for s in sweeps),
+        sweep_numbers=np.repeat(np.arange(len(sweeps)), [len(s.storage) for s in sweeps])[order],
+    )
+
+
+def _temperatures_in(name: str) -> list[float]:
+    """Return the different temperatures [K] in the name of a table. Temperatures without the sign ° count only if none
+    has this sign."""
+    stated = _STATED.findall(name)
+    chosen = [own for own in stated if own[1]] or stated
+    every = [float(value.replace(",", ".")) + 273.15 * (unit == "C") for value, _, unit in chosen]
+    return [T for k, T in enumerate(every) if all(abs(T - other) >= SAME for other in every[:k])]
 
 
 def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, float, Sweep]]:
@@ -111,14 +190,14 @@ def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, flo
     T = raw.get("temperature", np.full(len(sweep.storage), np.nan))
     missing = ~np.isfinite(T)
     if np.any(missing):
-        # A hyphen after a letter or a digit separates words ("Sweep-25C"), so it is not a minus sign.
-        stated = re.search(r"((?:(?<![^\W_])-)?\d+(?:[.,]\d+)?)\s*°?\s*([CK])\b", name)
-        if stated is None and np.all(missing):
+        stated = _temperatures_in(name)
+        if len(stated) != 1 and np.all(missing):
+            found = ", ".join(f"{T:.4g} °C" for T in celsius(np.array(stated)))
             raise InputError(
-                f"{path}: the table {repr(name) if name else 'of the file'} states no temperature; add a column "
-                "temperature_C"
+                f"{path}: the table {repr(name) if name else 'of the file'} states "
+                f"{f'several temperatures ({found})' if found else 'no temperature'}; add a column temperature_C"
             )
-        of_name = float(stated[1].replace(",", ".")) + 273.15 * (stated[2] == "C") if stated else np.nan
+        of_name = stated[0] if len(stated) == 1 else np.nan
         # The name cannot replace missing temperatures if the other rows differ from each other, or much from the name.
         known = T[~missing]
         if not np.isfinite(of_name) or (known.size and (np.ptp(known) >= SAME or np.ptp([*known, of_name]) > OFF_NAME)):

@@ -156,10 +156,15 @@ def sentences(found: Consistency, sweep: Sweep) -> list[str]:
     out, last = [], sweep.angular_frequency[-1] / (2 * np.pi)
     if found.onset is not None:
         hertz, bound = found.onset / (2 * np.pi), next(why for low, _, why in found.breaches if low == found.onset)
+        remedy = f"exclude them with --max-frequency {_rounded_up(hertz):.4g}"
+        if sweep.sweep_numbers is not None:  # the frequencies are shifted
+            remedy = (
+                "exclude the ends of the sweeps with --max-frequency, which limits the frequencies before the shift"
+            )
         out.append(
             f"above {hertz:.3g} Hz the storage modulus changes as in no material that relaxes ({bound}). This is the "
             "mark of the instrument: its inertia adds a term that grows as frequency^2. No model describes these "
-            f"points: exclude them with --max-frequency {_rounded_up(hertz):.4g}"
+            f"points: {remedy}"
         )
     inner = [b for b in found.breaches if found.onset is None or b[0] < found.onset]
     if inner:

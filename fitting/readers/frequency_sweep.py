@@ -37,17 +37,28 @@ class Sweep(NamedTuple):
     grey: np.ndarray | None = None  # (k, 3) frequency [rad/s], G', G'' [Pa] of k ignored points (mostly inertia)
     sd_estimated: bool = False  # True: the sd come from the scatter of the points and are only weights
     sd_before: bool = False  # True: the sd belong to the moduli before a correction, and are only weights
+    sweep_numbers: np.ndarray | None = None  # (n,) number of the sweep of each point, if several sweeps are joined
 
     @property
     def deviations(self) -> tuple[np.ndarray, np.ndarray]:
         """Scales [Pa] of the residuals of G' and G'': the given standard deviations, or else smooth curves through the
         moduli (the residuals are then relative).
 
-        Standard deviations that were estimated from few repeats are smoothed.
+        Standard deviations that were estimated from few repeats are smoothed, separately in each of several joined
+        sweeps.
         """
         omega, pairs = self.angular_frequency, ((self.storage, self.storage_sd), (self.loss, self.loss_sd))
-        first, second = (smooth_curve(omega, m) if sd is None else smooth_deviations(omega, m, sd) for m, sd in pairs)
-        return first, second
+        numbers = np.zeros(len(omega), int) if self.sweep_numbers is None else self.sweep_numbers
+        each = [numbers == k for k in np.unique(numbers)]
+        scales = []
+        for modulus, sd in pairs:
+            if sd is None:
+                scales.append(smooth_curve(omega, modulus))
+                continue
+            scales.append(np.empty(len(omega)))
+            for own in each:
+                scales[-1][own] = smooth_deviations(omega[own], modulus[own], sd[own])
+        return scales[0], scales[1]
 
     @property
     def as_measured(self) -> "Sweep":
@@ -168,7 +179,7 @@ def smooth_curve(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return _curve_of_bytes(np.asarray(x, float).tobytes(), np.asarray(y, float).tobytes())
 
 
-@lru_cache(maxsize=64)  # a fit uses the weights of the same sweep many times
+@lru_cache(maxsize=256)  # a fit uses the weights of the same sweep many times
 def _curve_of_bytes(*columns: bytes) -> np.ndarray:
     """Compute `smooth_curve` from the bytes of its columns."""
     from scipy.interpolate import make_smoothing_spline
@@ -224,7 +235,7 @@ def smooth_deviations(omega: np.ndarray, modulus: np.ndarray, sd: np.ndarray) ->
     return _smooth_of_bytes(*(np.asarray(v, float).tobytes() for v in (omega, modulus, sd)))
 
 
-@lru_cache(maxsize=64)  # a fit uses the weights of the same sweep many times
+@lru_cache(maxsize=256)  # a fit uses the weights of the same sweep many times
 def _smooth_of_bytes(*columns: bytes) -> np.ndarray:
     """Compute `smooth_deviations` from the bytes of its columns."""
     omega, modulus, sd = (np.frombuffer(column) for column in columns)
@@ -285,7 +296,7 @@ def within(sweep: Sweep, low: float | None, high: float | None) -> Sweep:
 
 def some(sweep: Sweep, kept: np.ndarray) -> Sweep:
     """Return the sweep with only the points where `kept` (n,) is true."""
-    names = ("angular_frequency", "storage", "loss", "storage_sd", "loss_sd", "inertia", "friction")
+    names = ("angular_frequency", "storage", "loss", "storage_sd", "loss_sd", "inertia", "friction", "sweep_numbers")
     columns: Content = {q: None if getattr(sweep, q) is None else getattr(sweep, q)[kept] for q in names}
     raw = None if sweep.raw is None else {q: v[kept] for q, v in sweep.raw.items()}
     return sweep._replace(**columns, raw=raw)

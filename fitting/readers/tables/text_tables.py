@@ -15,11 +15,13 @@ from liverjax.core.errors import InputError
 
 #: Maximum length of a line: Python's CSV reader cannot read longer cells.
 LONGEST_LINE = 131072
+#: The minus sign of Unicode. It is read as a hyphen, which numbers begin with in most files.
+MINUS = "\u2212"
 
 
 def text_of(path: Path, what: str = "a frequency sweep") -> str:
-    """Return the content of a text file of any encoding, or of a workbook, as text. `what` names the expected content
-    in messages.
+    """Return the content of a text file of any encoding, or of a workbook, as text with hyphens as minus signs. `what`
+    names the expected content in messages.
 
     Raises:
         InputError: the file does not exist, is empty, or is neither text nor a workbook.
@@ -35,8 +37,8 @@ def text_of(path: Path, what: str = "a frequency sweep") -> str:
     if not data.strip():
         raise InputError(f"{path} is empty: export the file again")
     if workbook.is_one(data):
-        return workbook.text(path, data, f"the sheet of {what.replace('a ', 'the ', 1)}")
-    text = _decoded(path, data)
+        return workbook.text(path, data, f"the sheet of {what.replace('a ', 'the ', 1)}").replace(MINUS, "-")
+    text = _decoded(path, data).replace(MINUS, "-")
     long = next((k for k, line in enumerate(text.splitlines(), 1) if len(line) > LONGEST_LINE), None)
     if long is not None and not text.lstrip().startswith("{"):
         raise InputError(
