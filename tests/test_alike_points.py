@@ -14,6 +14,7 @@ from fitting.fits.honesty.long_times import INTERVAL
 from fitting.fits.honesty.moduli_errors import fitted_moduli
 from fitting.fits.instrument import with_gap_error
 from fitting.methods import generalised_maxwell, kramers_kronig
+from fitting.methods.estimate import LEAST_FREEDOM, freedom_of_alike
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.uncertainty import equilibrium_error
 from fitting.readers.frequency_sweep import Sweep
@@ -46,6 +47,20 @@ def test_errors_of_a_drift_hold_the_truth():
             hits.append(np.abs(u.values - NUMBERS) < u.quantile * u.standard_errors)
     assert np.mean(before) < 0.7 and np.mean(after) > 0.82
     assert fit.warnings[-1].startswith(alike_points.SHARED) and fit.details[alike_points.INDEPENDENT] < 30
+
+
+def test_quantiles_are_those_of_independent_moduli():
+    """The degrees of freedom were those of all moduli, so four of five parameters were too often outside."""
+    found = []
+    for seed in range(4):
+        s = drifting(seed, 10.0)
+        fit = alike_points.with_alike_points(viscoelastic.closed_form(s, 2), s)
+        found.append((fit.details[alike_points.INDEPENDENT], fit.uncertainty.freedom))
+        assert fitted_moduli(fit, OMEGA[:2], False).freedom == fit.uncertainty.freedom
+    independent, freedom = np.array(found).T
+    assert np.array_equal(freedom, np.maximum(independent - 5, LEAST_FREEDOM))
+    assert freedom.min() == 3 and 3 < freedom.max() < 40
+    assert freedom_of_alike(2.0, 7, 6.0) == 2.0  # never more than with independent noise
 
 
 @pytest.mark.slow

@@ -65,13 +65,25 @@ def test_the_choice_of_the_model_is_among_them(chosen):
     found = moduli_errors.fitted_moduli(chosen, OMEGA, False)
     np.testing.assert_array_equal(found.values, values)
     np.testing.assert_allclose(found.standard_errors, np.sqrt(variance), rtol=1e-10)
-    # The criterion is corrected for few data, and uses sums of squares alone.
+    # The criterion is corrected for few data, and uses sums of squares alone. It counts the size of the noise.
     rss = [np.sum(np.asarray(f.solution.residuals)[:62] ** 2) for f in alone.values()]
-    k = [len(f.solution.u) if f.kind.effective is None else f.kind.effective for f in alone.values()]
+    k = [1 + (len(f.solution.u) if f.kind.effective is None else f.kind.effective) for f in alone.values()]
     aicc = np.array([62 * np.log(s / 62) + 2 * n + 2 * n * (n + 1) / (62 - n - 1) for s, n in zip(rss, k, strict=True)])
     by_hand = np.exp(-0.5 * (aicc - aicc.min()))
     by_hand = dict(zip(alone, by_hand / by_hand.sum(), strict=True))
     assert all(weights[name] == pytest.approx(by_hand[name], abs=1e-3) for name in weights)
+
+
+def test_the_size_of_the_noise_counts_as_a_parameter():
+    """Without it, models with many parameters had too much weight in short sweeps."""
+    omega, rng = np.geomspace(0.3, 30, 5), np.random.default_rng(0)
+    G = 300 + 500 * (1j * omega) ** 0.3
+    noise = 1 + 0.02 * rng.standard_normal((2, 5))
+    sweep = Sweep(omega, G.real * noise[0], G.imag * noise[1])
+    rival, fit = (viscoelastic.closed_form(sweep, modes) for modes in (1, 2))
+    rss = [float(np.sum(np.asarray(f.solution.residuals) ** 2)) for f in (fit, rival)]
+    aicc = [10 * np.log(s / 10) + 2 * k + 2 * k * (k + 1) / (10 - k - 1) for s, k in zip(rss, (6, 4), strict=True)]
+    assert moduli_errors._akaike(fit) - moduli_errors._akaike(rival) == pytest.approx(aicc[0] - aicc[1], rel=1e-9)
 
 
 def repeated(seed: int) -> Sweep:

@@ -320,6 +320,37 @@ def test_the_posterior_through_the_simulation_is_checked_by_simulating(tmp_path)
     assert "log density is wrong by up to 2" in lost.warnings()[0]
 
 
+def test_the_evidence_prefers_the_true_number_of_modes_where_the_noise_is_weighted():
+    """The evidence ignored the weights, which come from the residuals of each fit, and was best for one mode."""
+    w, rng = np.geomspace(0.1, 100, 31), np.random.default_rng(1)
+    truth = generalised_maxwell.Maxwell(np.float64(1000.0), np.array([0.3, 0.4]), np.array([1.0, 0.05]))
+    storage, loss = generalised_maxwell.moduli(truth, w)
+    s = Sweep(w, storage * (1 + 0.005 * rng.normal(size=31)), loss * (1 + 0.03 * rng.normal(size=31)))
+    fits = [viscoelastic.closed_form(s, modes) for modes in (1, 2)]
+    assert fits[1].noise_root is not None
+    one, two = (posterior.of_sweep(fit, s, 100).chains.log_evidence.mean() for fit in fits)
+    assert two > one + 50
+
+
+@pytest.mark.parametrize("name", ["fractional_maxwell", "fractional_parallel"])
+def test_both_exponents_have_the_stated_prior(name):
+    """The ratio of the exponents was uniform, so the density of the larger exponent a was 1 / a times too large."""
+    (model,) = (m for m in springpots.FRACTIONAL if m.name == name)
+    prior = posterior.Springpots(model, (0.0, 10.0), lambda u: model.values(springpots.full(model, u), 1.0))
+    drawn = prior.from_prior(np.random.default_rng(0), 20_000, 4)
+    exponents = np.sort(prior.numbers(drawn)[:, [1, 3]], axis=1)
+    # Two uniform numbers in order have the means 1/3 and 2/3, and the variance 1/18.
+    assert np.allclose(exponents.mean(axis=0), [1 / 3, 2 / 3], atol=0.01)
+    assert np.allclose(exponents.var(axis=0), 1 / 18, atol=0.002)
+    # The moments of `log_prior` on a grid of logits are the same.
+    grid = np.stack(np.meshgrid(*[np.linspace(-12, 12, 121)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+    u = np.full((len(grid), 4), 5.0)
+    u[:, ~prior._moduli] = grid
+    weights = np.exp(prior.log_prior(u))
+    own = np.sort(prior.numbers(u)[:, [1, 3]], axis=1)
+    assert np.allclose(weights @ own / weights.sum(), [1 / 3, 2 / 3], atol=0.002)
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [

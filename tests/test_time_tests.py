@@ -267,6 +267,23 @@ def test_a_test_without_relaxation_is_told_with_its_modulus(kind):
     assert not any("no relaxation" in w for w in found.warnings)
 
 
+def test_the_elastic_modulus_contains_the_errors_of_base_line_and_correlation():
+    """The modulus of 1000 Pa had an error of 2 Pa, although the offset alone caused an error of 10 Pa."""
+    time, rng = np.linspace(0, 57, 60), np.random.default_rng(0)
+    stress = 100 + 3 * rng.standard_normal(60)
+    test = TimeTest("relaxation", time, np.full(60, 0.1), stress, time > 0)
+    alone = fits.fit(test).details["elastic"]
+    assert alone["standard_error_of_base_line"] == 0 and 2 < alone["standard_error"] < 6
+    found = fits.fit(test._replace(offset_error=1.0))
+    elastic = found.details["elastic"]
+    assert elastic["standard_error_of_base_line"] == pytest.approx(10, rel=0.02)
+    assert elastic["standard_error"] == pytest.approx(np.hypot(alone["standard_error"], 10), rel=0.02)
+    more = fits.with_elastic_error(found, 3.0)
+    error = np.hypot(3 * alone["standard_error"], elastic["standard_error_of_base_line"])
+    assert more.details["elastic"]["standard_error"] == pytest.approx(error, rel=1e-9)
+    assert more.warnings[0] == fits._told_of_elastic(more.details["elastic"]) != found.warnings[0]
+
+
 def decayed(tau: np.ndarray, shares: np.ndarray, noise: float) -> TimeTest:
     """A step of strain of 0.02 at 0 s on a fluid, and stresses until they have decayed to 0."""
     t = np.linspace(0.1, 30, 300)

@@ -31,7 +31,7 @@ from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.sampling import tempering
 from fitting.methods.sampling.diagnostics import r_hat
 from fitting.methods.sampling.tempering import Chains, Density
-from fitting.methods.springpots import FRACTIONAL, Fractional
+from fitting.methods.springpots import FRACTIONAL, LARGER, Fractional
 from fitting.methods.uncertainty import parameter_names
 from fitting.readers.rheometer import Sweep
 from fitting.readers.time_tests import TimeTest
@@ -46,7 +46,7 @@ PRIORS = {
     "log-uniform from a tenth of the shortest to ten times the longest time that the data resolve; the ratios and "
     "the equilibrium fraction are uniform on the simplex (all values that add up to 1)",
     "fractional": "moduli at the middle of the band are log-uniform within a factor of 1000 of the measured moduli; "
-    "exponents are uniform",
+    "exponents are uniform between 0 and 1; of two exponents, all pairs in the order of the model are equally probable",
 }
 #: Words of `PRIORS` -> words for a relaxation or creep test. Its prior is relative to the fitted G0 (`of_time_test`).
 _OF_TIME_TESTS = {
@@ -123,13 +123,15 @@ class Target(NamedTuple):
     prior: "Modes | Springpots | WithInstrument"
     deviations_given: bool
     weight: float = 1.0  # number of independent residuals, divided by the number of residuals
+    log_scales: float = 0.0  # half the log determinant of the covariance of the data for the common factor s = 1
 
     def log_likelihood(self, u: np.ndarray) -> np.ndarray:
         """Return the log likelihood (W,) of W vectors u (W, P), up to a constant. The common factor s of the errors is
-        integrated out."""
+        integrated out. The constant is the same for all fits of the same data with the same `weight`."""
         with np.errstate(all="ignore"):  # if numbers overflow, the likelihood is 0
             r = self.residuals(u)
-            return self.weight * log_likelihood(np.sum(r * r, axis=-1), r.shape[-1], self.deviations_given)
+            found = log_likelihood(np.sum(r * r, axis=-1), r.shape[-1], self.deviations_given)
+            return self.weight * found - self.log_scales
 
 
 def log_likelihood(square: np.ndarray, count: int, deviations_given: bool) -> np.ndarray:
@@ -233,7 +235,8 @@ class Modes(NamedTuple):
 
 class Springpots(NamedTuple):
     """Prior and parameters of a fractional model. The coordinates u are the free variables of the model (see
-    `fitting.methods.springpots`): logs of moduli and logits of exponents."""
+    `fitting.methods.springpots`): logs of moduli, the logit of the larger exponent, and in models with two springpots
+    the logit of the ratio of both exponents."""
 
     model: Fractional
     moduli: tuple[float, float]  # bounds of the log moduli
@@ -242,20 +245,27 @@ class Springpots(NamedTuple):
 
     @property
     def _moduli(self) -> np.ndarray:
-        """Whether each entry of u is the log of a modulus. The other entries are logits of exponents."""
+        """Whether each entry of u is the log of a modulus. The other entries are logits."""
         return np.array([k % 2 == 0 for k in self.model.free])
+
+    @property
+    def _larger(self) -> np.ndarray:
+        """For each entry of u, 1 if it is the logit of the larger one of two exponents, otherwise 0. For a uniform
+        density of both exponents, the density of the larger exponent is proportional to this exponent."""
+        return np.array([float(k == LARGER and len(self.model.free) - self._moduli.sum() > 1) for k in self.model.free])
 
     def log_prior(self, u: np.ndarray) -> np.ndarray:
         """Return the log prior (W,) of W vectors u (W, P), up to a constant."""
         moduli, exponents = u[:, self._moduli], u[:, ~self._moduli]
         inside = np.all((moduli > self.moduli[0]) & (moduli < self.moduli[1]), axis=-1)
-        slopes = -np.logaddexp(0, exponents) - np.logaddexp(0, -exponents)
+        slopes = -np.logaddexp(0, exponents) - (1 + self._larger[~self._moduli]) * np.logaddexp(0, -exponents)
         return np.where(inside, slopes.sum(axis=-1), -np.inf)
 
     def from_prior(self, rng: np.random.Generator, count: int, parameters: int) -> np.ndarray:
         """Draw u (count, parameters) from the prior."""
         moduli = rng.uniform(*self.moduli, (count, parameters))
-        return np.where(self._moduli, moduli, scipy.special.logit(rng.random((count, parameters))))
+        shares = rng.random((count, parameters)) ** (1 / (1 + self._larger))
+        return np.where(self._moduli, moduli, scipy.special.logit(shares))
 
     def names(self, parameters: int) -> tuple[str, ...]:
         """Return the names of the reported parameters."""
@@ -379,7 +389,9 @@ def _beside_instrument(fit: Fit, sweep: Sweep, residuals: Callable[[np.ndarray],
 
 def _sweep_target(kind: Kind, sweep: Sweep, residuals: Callable[[np.ndarray], np.ndarray]) -> Target:
     size = np.hypot(sweep.storage, sweep.loss)
-    return target(kind, residuals, sweep.resolved, size, sweep.noise_given)
+    # The scales may come from the residuals of the fit (`with_weights_shown`), so they differ between fits.
+    log_scales = float(np.sum(np.log(np.concatenate(sweep.deviations))))
+    return target(kind, residuals, sweep.resolved, size, sweep.noise_given)._replace(log_scales=log_scales)
 
 
 #: SIMULATED: number of draws that are simulated. DIFFERENT: the program warns if the approximate log density of one of
@@ -421,7 +433,7 @@ def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, se
     )
     exact = np.stack([np.asarray(program(jax.numpy.asarray(u), data)[0]) for u in modes])
     exact += own.residuals(some) - residuals(modes)  # adds the effect of the errors of the instrument
-    likelihood = log_likelihood(np.sum(exact**2, axis=-1), exact.shape[-1], own.deviations_given)
+    likelihood = own._replace(residuals=lambda _: exact).log_likelihood(some)
     apart = float(np.max(np.abs(likelihood - own.log_likelihood(some))))
     checked = {"draws": float(SIMULATED), "largest_difference": apart}
     return found._replace(simulated=checked, seconds=found.seconds + time.perf_counter() - begin)
@@ -442,12 +454,15 @@ def of_time_test(fit: TimeFit, test: TimeTest, count: int, seed: int = 0) -> Pos
         residuals = jax.jit(jax.vmap(springpots_in_time.residuals_of_springpot(fit.kind.name, test)))
     size = np.abs(fit.model.shear_modulus) * np.array([1e-2, 1.0])
     weight = fit.details.get(INDEPENDENT, len(fit.measured)) / len(fit.measured)
-    noise = time_tests.data_in_time(test)[-1] * max(fit.uncertainty.noise, QUIETEST)
+    scales = time_tests.data_in_time(test)[-1]
+    noise = scales * max(fit.uncertainty.noise, QUIETEST)
     base_line = np.sqrt(weight) * test.base_line_errors(time_tests.thinned(test)) / noise
+    common = np.linalg.slogdet(np.eye(len(base_line)) + base_line @ base_line.T)[1]
+    log_scales = weight * float(np.sum(np.log(scales))) + 0.5 * float(common)
     own = target(fit.kind, _beside_base_line(residuals, base_line), test.resolved, size, False)
     assert not isinstance(own.prior, WithInstrument)
     prior = own.prior._replace(words=_of_time_test(own.prior.words))
-    return sample(own._replace(weight=weight, prior=prior), len(fit.solution.u), count, seed)
+    return sample(own._replace(weight=weight, log_scales=log_scales, prior=prior), len(fit.solution.u), count, seed)
 
 
 def _of_time_test(words: str) -> str:

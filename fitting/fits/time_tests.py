@@ -16,7 +16,7 @@ from fitting.fits import viscoelastic
 from fitting.fits.families import choice
 from fitting.fits.viscoelastic import FLUID, Kind
 from fitting.methods import generalised_maxwell, kramers_kronig, time_response, uncertainty
-from fitting.methods.estimate import Estimate
+from fitting.methods.estimate import Estimate, without_part
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.host import Array, arrays_of
 from fitting.methods.least_squares import Solution, from_starts
@@ -410,9 +410,26 @@ def _without_relaxation(test: TimeTest, chosen: TimeFit) -> dict[str, float] | N
     rss = max(float(np.sum(((ratio * x - y) / s) ** 2)), 2e-300 * m)
     if ratio <= 0 or m * np.log(rss / m) + np.log(m) > criterion(chosen):
         return None
-    error = float(np.sqrt(rss / max(m - 1, 1) / square)) / ratio
     modulus = ratio if test.kind == "relaxation" else 1 / ratio
-    return {"shear_modulus": modulus, "standard_error": modulus * error}
+    of_noise = modulus / ratio * float(np.sqrt(rss / max(m - 1, 1) / square))
+    shifts = test.base_line_errors(rows) @ (x / s**2) / square
+    of_offset = modulus / ratio * float(np.linalg.norm(shifts))
+    error = float(np.hypot(of_noise, of_offset))
+    return {"shear_modulus": modulus, "standard_error": error, "standard_error_of_base_line": of_offset}
+
+
+def with_elastic_error(fit: TimeFit, factor: float) -> TimeFit:
+    """Return the fit, in which the standard error due to noise of the elastic modulus (`ELASTIC`) is larger by a
+    factor. The error of the subtracted base line does not change."""
+    if ELASTIC not in fit.details:
+        return fit
+    before = fit.details[ELASTIC]
+    of_offset = before["standard_error_of_base_line"]
+    of_noise = factor * without_part(before["standard_error"], of_offset)
+    after = before | {"standard_error": float(np.hypot(of_noise, of_offset))}
+    old, new = _told_of_elastic(before), _told_of_elastic(after)
+    warnings = tuple(new if sentence == old else sentence for sentence in fit.warnings)
+    return fit._replace(details=fit.details | {ELASTIC: after}, warnings=warnings)
 
 
 def _told_of_elastic(elastic: dict[str, float]) -> str:

@@ -27,6 +27,8 @@ from fitting.readers.rheometer import Sweep
 #: Number of entries of the vector u of unknowns: log E, logit(gamma / alpha), log V, logit(alpha), log W, logit(beta /
 #: alpha).
 SIZE = 6
+#: Index of logit(alpha) in u. Alpha is the larger exponent if a model has two.
+LARGER = 3
 
 
 class Fractional(NamedTuple):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fitting.methods import generalised_maxwell
-from fitting.methods.estimate import Estimate, estimated
+from fitting.methods.estimate import Estimate, estimated, without_part
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.host import Array, arrays_of
 from fitting.methods.least_squares import Solution, levenberg_marquardt
@@ -117,8 +117,10 @@ def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, poin
     """Compute 95 % intervals by profile likelihood, for a closed-form fit of Prony modes of a solid. One parameter is
     fixed at several values, and all other parameters are fitted again for each value.
 
-    The likelihood contains only the noise. If `uncertainty` has errors of the gap or the instrument too, these errors
-    widen the interval. The squares of both half widths are added. This is right to first order in these errors.
+    The likelihood contains only noise of the same relative size in G' and G''. If `uncertainty` has errors of the gap
+    or the instrument too, or larger errors of the noise, these errors widen the interval. The squares of both half
+    widths are added. If the noise in `uncertainty` gives a smaller error (for example because G' has more noise than
+    G''), the interval is shortened by this ratio. Both changes are right to first order.
 
     Returns:
         [low, high] for each name. An end is None if the likelihood does not fall to the limit of the interval within
@@ -158,18 +160,21 @@ def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, poin
             np.asarray(v) for v in along(j, jnp.maximum(grid, 1e-3 * center), 1e3 * uncertainty.noise / error)
         )
         rise = (chi2 - best) / uncertainty.noise**2 - uncertainty.quantile**2
-        middle, shared = points // 2, max(0.0, uncertainty.standard_errors[j] ** 2 - error**2)
+        middle, whole = points // 2, float(uncertainty.standard_errors[j])
+        common = 0.0 if uncertainty.shared is None else float(np.linalg.norm(uncertainty.shared[j]))
+        ratio = min(1.0, without_part(whole, common) / error)
+        half = uncertainty.quantile * without_part(whole, ratio * error)
         ends = _crossing(reached[middle::-1], rise[middle::-1]), _crossing(reached[middle:], rise[middle:])
-        intervals[name] = [_farther(end, center, uncertainty.quantile * np.sqrt(shared)) for end in ends]
+        intervals[name] = [_farther(end, center, ratio, half) for end in ends]
     return intervals
 
 
-def _farther(end: float | None, center: float, half: float) -> float | None:
-    """Return the end of an interval around `center`, moved outwards because of one more independent error. `half`: half
-    width of the interval of this error alone."""
-    if end is None or half == 0:
-        return end
-    return float(center + np.copysign(np.hypot(end - center, half), end - center))
+def _farther(end: float | None, center: float, ratio: float, half: float) -> float | None:
+    """Return the end of an interval around `center`, if its distance from the center is multiplied by `ratio` and one
+    more independent error is added. `half`: half width of the interval of this error alone."""
+    if end is None:
+        return None
+    return float(center + np.copysign(np.hypot(ratio * (end - center), half), end - center))
 
 
 def _crossing(x: np.ndarray, rise: np.ndarray) -> float | None:

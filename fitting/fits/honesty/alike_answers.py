@@ -114,6 +114,7 @@ def with_alike_noise(fit: TimeFit) -> TimeFit:
         f"the noise of neighbouring values is correlated, or the model is inadequate. The {len(r)} values carry the "
         f"information of {alike.independent:.0f} independent values; the standard errors include this effect"
     )
+    fit = time_tests.with_elastic_error(fit, np.sqrt(len(r) / alike.independent))
     details = fit.details | {INDEPENDENT: float(alike.independent)}
     return fit._replace(uncertainty=modes, parameters=own, warnings=(*fit.warnings, sentence), details=details)
 

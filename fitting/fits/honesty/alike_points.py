@@ -10,7 +10,7 @@ import numpy as np
 
 from fitting.fits.viscoelastic import EXACT, Fit, sizes_of_noise
 from fitting.methods import host, uncertainty
-from fitting.methods.estimate import Estimate, errors_and_correlation, wider
+from fitting.methods.estimate import Estimate, errors_and_correlation, freedom_of_alike, wider
 from fitting.methods.noise.alike_noise import LOST, Alike, along_rows
 from fitting.readers.frequency_sweep import Sweep, mostly_repeated
 
@@ -33,9 +33,9 @@ def with_alike_points(fit: Fit, sweep: Sweep) -> Fit:
     if alike is None:
         return fit
     u, own = np.asarray(fit.solution.u), fit.parameters
-    modes = not_below(fit.uncertainty, partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell), u, alike.root)
+    modes = not_below(fit.uncertainty, partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell), u, alike)
     if own is not None and fit.kind.values is not None:
-        own = not_below(own, fit.kind.values, u, alike.root)
+        own = not_below(own, fit.kind.values, u, alike)
     told = (
         f"{SHARED}, or the model is inadequate. The {2 * len(fit.storage)} moduli carry the information of "
         f"{alike.independent:.0f} independent moduli; the standard errors include this effect"
@@ -77,21 +77,27 @@ def with_weights_shown(fit: Fit, sweep: Sweep) -> Sweep:
     return sweep._replace(storage_sd=first, loss_sd=second, sd_estimated=True)
 
 
-def not_below(estimate: Estimate, natural_of: Callable, u: np.ndarray, root: np.ndarray) -> Estimate:
-    """Return the estimate with standard errors from another covariance of the p unknowns u, which allows for another
-    kind of noise. The error of a parameter due to noise is replaced only if this covariance gives a larger error.
-    Errors that are common to all points do not change. `natural_of`: function from u to the parameters. `root`: square
-    root (p, k) of the covariance, with k columns.
+def not_below(estimate: Estimate, natural_of: Callable, u: np.ndarray, alike: Alike) -> Estimate:
+    """Return the estimate with standard errors and degrees of freedom for correlated noise. The error of a parameter
+    due to noise is replaced only if correlated noise gives a larger error. Errors that are common to all points do not
+    change.
+
+    Args:
+        estimate: the estimate for independent noise.
+        natural_of: function from the unknowns u to the parameters.
+        u: unknowns (p,) at the minimum.
+        alike: the correlated noise.
     """
     shared = np.zeros((len(estimate.values), 0)) if estimate.shared is None else estimate.shared
     noise = np.asarray(estimate.root)[:, : np.shape(estimate.root)[1] - shared.shape[1]]
     before = np.linalg.norm(noise, axis=1)
-    size = np.linalg.norm(host.with_jacobian(natural_of, u)[1] @ root, axis=1)
+    size = np.linalg.norm(host.with_jacobian(natural_of, u)[1] @ alike.root, axis=1)
     factor = np.maximum(1.0, size / np.where(before > 0, before, np.inf))
     noise = factor[:, None] * noise
     errors, correlation = errors_and_correlation(noise)
     errors = np.where(np.isfinite(estimate.standard_errors), errors, np.inf)  # infinite errors stay infinite
-    found = estimate._replace(root=noise, standard_errors=errors, correlation=correlation, shared=None)
+    freedom = freedom_of_alike(estimate.freedom, estimate.components, alike.independent)
+    found = estimate._replace(root=noise, standard_errors=errors, correlation=correlation, shared=None, freedom=freedom)
     for direction in shared.T:
         found = wider(found, direction)
     return found

@@ -20,7 +20,7 @@ from fitting.fits.together import measured_tests, residuals_of_tests
 from fitting.fits.together.measured_tests import Measured
 from fitting.fits.together.residuals_of_tests import Together
 from fitting.fits.viscoelastic import SHORT, Fit, Kind
-from fitting.methods.estimate import without_part
+from fitting.methods.estimate import freedom_of_alike, without_part
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.host import Array, arrays_of
 from fitting.methods.least_squares import Solution, from_starts
@@ -90,9 +90,10 @@ def equilibrium_interval(
     least, (modulus, found) = 2 * float(best[1].cost), best
     if not np.isfinite(least):
         return None
-    freedom = max(1.0, len(found.residuals) - len(found.u) - 1)
+    points = len(found.residuals)
+    freedom = max(1.0, points - len(found.u) - 1)
     spread = max(1.0, least / freedom)
-    quantile = float(scipy.special.stdtrit(freedom, 0.975))
+    quantile = float(scipy.special.stdtrit(freedom_of_alike(freedom, points, independent * points), 0.975))
     limit = least + quantile**2 * spread / independent
     first = min(quantile * error, 0.1 * whole) if error > 0 else 0.01 * whole
     ends = [_end(family, modulus, found, limit, sign * first, whole) for sign in (-1, 1)]

@@ -61,8 +61,10 @@ def _weighed(fit: Fit) -> list[tuple[float, Fit]]:
 
 
 def _akaike(fit: Fit) -> float:
-    """Return Akaike's information criterion with the correction for few data."""
-    m, k = 2 * len(fit.storage), number_of_parameters(fit)
+    """Return Akaike's information criterion with the correction for few data. The size of the noise counts as a
+    parameter, because the criterion estimates it from the residuals. If the data have standard deviations, it is their
+    common factor."""
+    m, k = 2 * len(fit.storage), number_of_parameters(fit) + 1
     return float(m * np.log(mean_square(fit)) + 2 * k * m / max(1.0, m - k - 1))
 
 
@@ -99,4 +101,4 @@ def _of_one_model(fit: Fit, omega: np.ndarray, noise_given: bool) -> Estimate:
     if alike_points.INDEPENDENT not in fit.details:
         return found
     alike = alike_points.alike_of(fit)
-    return found if alike is None else alike_points.not_below(found, of, np.asarray(fit.solution.u), alike.root)
+    return found if alike is None else alike_points.not_below(found, of, np.asarray(fit.solution.u), alike)
