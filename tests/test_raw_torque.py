@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from conftest import SHARED
 
+from fitting.readers.frequency_sweep import Sweep
 from fitting.readers.rheometer import read_sweep, without_inertia
 from liverjax import InputError
 
@@ -67,6 +68,41 @@ def test_an_empty_cell_takes_one_point_away_and_not_the_column(lines, tmp_path):
     assert f"{len(lines)} of 20 points have an empty cell in the raw columns" in kept.notes[0]
     assert "the raw torque shows" in kept.notes[0]  # not only the phase
     assert np.allclose(kept.inertia, whole.inertia, rtol=1e-6) and len(kept.grey) == len(whole.grey)
+
+
+def test_a_displacement_of_zero_is_an_empty_cell(tmp_path):
+    """A single 0 switched the search for the inertia off, without a message."""
+    s = export(tmp_path / "z.txt", sample=False, phase=False)
+    for name in ("angle", "torque"):
+        column = s.raw[name].copy()
+        column[3] = 0
+        kept = without_inertia(s._replace(raw=s.raw | {name: column}), RADIUS, HEIGHT)
+        assert "1 of 20 points have an empty cell in the raw columns, or a torque or displacement of 0" in kept.notes[0]
+        assert np.allclose(kept.inertia, without_inertia(s, RADIUS, HEIGHT).inertia, rtol=1e-6)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3, 5])
+def test_raw_cells_in_a_few_rows_show_no_inertia_that_is_not_there(rows):
+    """The inertia of one row agreed with itself. It was extrapolated to the end of the sweep, and points were lost."""
+    noise = 1 + 0.01 * np.random.default_rng(0).standard_normal((3, len(OMEGA)))
+    measured = G.real * noise[0] + 1j * G.imag * noise[1]
+    M = np.where(np.arange(len(OMEGA)) < rows, K * measured * noise[2] * 1e-3, np.nan)
+    raw = {"torque": np.abs(M), "angle": 1e-3 + 0 * np.abs(M), "phase": np.angle(M)}
+    s = Sweep(OMEGA, measured.real, measured.imag, raw=raw)
+    kept = without_inertia(s, RADIUS, HEIGHT)
+    assert kept.inertia is None and kept.grey is None
+
+
+@pytest.mark.parametrize("close", [False, True])
+def test_repeats_of_one_frequency_do_not_agree_on_an_inertia(close):
+    """The torque of the sample was mistaken for the inertia 2 K G' / omega^2 if the highest frequency was repeated. The
+    same holds for frequencies that are nearly equal."""
+    frequencies = np.geomspace(1, 200, 6)
+    omega = np.repeat(np.append(frequencies, [199.8, 199.9, 200.1, 200.2]) if close else frequencies, 3)
+    omega.sort()
+    G = 5000 * (1j * omega) ** 0.1 * (1 + 0.005 * np.random.default_rng(0).standard_normal(len(omega)))
+    raw = {"torque": np.abs(K * G) * 1e-3, "angle": 1e-3 + 0 * omega}
+    assert without_inertia(Sweep(omega, G.real, G.imag, raw=raw), RADIUS, HEIGHT).inertia is None
 
 
 def test_the_phase_alone_tells_the_share_of_the_instrument(tmp_path):

@@ -1,5 +1,5 @@
-"""Options and steps that several commands share: number of modes, draws of the posterior, material cards, reading a
-sweep."""
+"""Options and steps of the commands: number of modes, draws of the posterior, material cards, reading a sweep, fitting
+a sweep in closed form."""
 
 import argparse
 import contextlib
@@ -9,14 +9,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fitting.commands.progress import named_bar
 from liverjax.core.errors import InputError
+from liverjax.core.files import writable
 
 if TYPE_CHECKING:
     from fitting.fits.stress_stretch import LawFit
-    from fitting.fits.viscoelastic import Kind
+    from fitting.fits.viscoelastic import Fit, Kind
     from fitting.methods.estimate import Estimate
-    from fitting.methods.generalised_maxwell import Maxwell
+    from fitting.methods.generalised_maxwell import Maxwell, Spectrum
     from fitting.readers.frequency_sweep import Sweep
+    from fitting.rigs.compression import Shares
 
 
 def add_modes(command: argparse.ArgumentParser) -> None:
@@ -97,10 +100,11 @@ def write_cards(out: Path, model: "Maxwell", of_fit: "Estimate | None" = None) -
     print(f"written: {out}/cards")
 
 
-def usable_sweep(options: argparse.Namespace, path: Path) -> "Sweep":
+def usable_sweep(options: argparse.Namespace, path: Path, error_is_fitted: bool = False) -> "Sweep":
     """Read a sweep, and ignore the points at which the instrument dominates. If --max-frequency is given, only these
     points are ignored: points outside the band, and points at which the raw torque or the raw phase shows too much
-    inertia of the instrument (`without_inertia`)."""
+    inertia of the instrument (`without_inertia`). The same holds if the file shows the inertia and its error is fitted
+    later (`error_is_fitted`), because this error may explain the mark of the instrument."""
     from fitting.readers import rheometer
 
     try:
@@ -112,7 +116,8 @@ def usable_sweep(options: argparse.Namespace, path: Path) -> "Sweep":
         raise InputError(f"{path} contains no frequency sweep: give it to `python -m fitting {other}`") from None
     sweep = rheometer.within(sweep, options.min_frequency, options.max_frequency)
     sweep = rheometer.without_inertia(sweep, options.radius, options.height)
-    return sweep if options.max_frequency else without_instrument_or_sample(options, sweep)
+    explained = error_is_fitted and sweep.inertia is not None
+    return sweep if options.max_frequency or explained else without_instrument_or_sample(options, sweep)
 
 
 def without_instrument_or_sample(options: argparse.Namespace, sweep: "Sweep") -> "Sweep":
@@ -146,6 +151,69 @@ def without_instrument_or_sample(options: argparse.Namespace, sweep: "Sweep") ->
     grey = grey if sweep.grey is None else np.concatenate([sweep.grey, grey])
     whole = some(sweep, good)
     return whole._replace(grey=grey if len(grey) else None, notes=(*whole.notes, *told))
+
+
+def may_explain_the_mark(options: argparse.Namespace) -> bool:
+    """Return whether the fit of the instrument's errors is tried before points with the mark of the instrument are
+    excluded. These points determine the error of the inertia best. The fit needs Prony modes. If the inertia of the
+    sample is subtracted, too, the points are excluded first, because this step may fail at such points."""
+    return options.model in ("prony", "auto") and options.density is None and not options.max_frequency
+
+
+def corrected_fit(
+    options: argparse.Namespace, sweep: "Sweep", factors: "Shares | None"
+) -> tuple["Fit", "Sweep", "Spectrum"]:
+    """Return the fit in closed form, the corrected sweep and its spectrum.
+
+    If the sweep has points with the mark of the instrument, and the fitted error of the inertia does not explain this
+    mark, these points are excluded and the fit is repeated.
+
+    Args:
+        options: options of the command.
+        sweep: usable points, without the inertia of the sample.
+        factors: as for `of_compressed_sample`; None: the sample is not compressed.
+    """
+    from fitting.methods import generalised_maxwell, kramers_kronig
+
+    fit, corrected = _with_instrument(options, sweep, factors)
+    if sweep.inertia is not None and may_explain_the_mark(options):
+        rest = kramers_kronig.without_instrument(sweep)
+        unexplained = corrected is sweep or kramers_kronig.onset_of(corrected) is not None
+        if rest is not sweep and unexplained:
+            fit, corrected = _with_instrument(options, rest, factors)
+    return fit, corrected, generalised_maxwell.refuse_impossible(corrected)
+
+
+def _with_instrument(options: argparse.Namespace, sweep: "Sweep", factors: "Shares | None") -> tuple["Fit", "Sweep"]:
+    """Return the fit and the sweep, both corrected for the errors of the instrument."""
+    from fitting.fits import compressed_sample, instrument, viscoelastic
+
+    if options.modes != "auto":
+        viscoelastic.check_modes(sweep, options.modes)
+    dense = instrument.spectrum_before_correction(sweep)
+    writable(options.out, ("fit.json", "fit.png", "fit.h5"))
+    fit = _uncorrected(options, sweep, dense)
+    if factors is not None:
+        fit = compressed_sample.of_compressed_sample(fit, sweep, factors)
+    return instrument.without_error_of_inertia(fit, sweep, factors)
+
+
+def _uncorrected(options: argparse.Namespace, sweep: "Sweep", dense: "Spectrum") -> "Fit":
+    """Return the fit of the chosen model in closed form."""
+    from fitting.fits import viscoelastic
+    from fitting.fits.families import models
+
+    prony = None
+    if options.model in ("prony", "auto"):
+        if options.modes == "auto":
+            with named_bar("closed form") as told:
+                prony = viscoelastic.choose_modes(sweep, dense, options.optimizer, told)[0]
+        else:
+            prony = viscoelastic.closed_form(sweep, options.modes, dense, options.optimizer)
+    if options.model == "prony":
+        assert prony is not None
+        return prony
+    return models.choose(sweep, options.model, prony, dense)
 
 
 def _other_command(path: Path) -> str | None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from fitting.commands import shared_options
 from fitting.commands.exit_codes import EXIT_CODES
-from fitting.commands.progress import cost_bar, named_bar
+from fitting.commands.progress import cost_bar
 from liverjax import laws
 from liverjax.core.errors import InputError
 from liverjax.core.files import writable
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from fitting.fits.posterior import Posterior
     from fitting.fits.simulated_rheometer import Simulation
     from fitting.fits.viscoelastic import Fit
-    from fitting.methods.generalised_maxwell import Spectrum
     from fitting.readers.rheometer import Sweep
 
 
@@ -163,7 +162,8 @@ def run(options: argparse.Namespace) -> int:
     shift: Content = {}
     tests = _tests_to_predict(options)  # read now, so that an error in a file does not discard a finished fit
     if options.master is None:
-        sweep, shifted = shared_options.usable_sweep(options, options.sweep[0]), ""
+        sweep = shared_options.usable_sweep(options, options.sweep[0], shared_options.may_explain_the_mark(options))
+        shifted = ""
     else:
         sweep, shift, shifted = _master(options)
     for note in sweep.notes:
@@ -389,30 +389,11 @@ def _check_together(options: argparse.Namespace) -> None:
             raise InputError(f"--with fits modes or springpots to one sample in closed form: remove {name}")
 
 
-def _closed(options: argparse.Namespace, sweep: "Sweep", dense: "Spectrum") -> "Fit":
-    """Return the fit of the chosen model in closed form."""
-    from fitting.fits import viscoelastic
-    from fitting.fits.families import models
-
-    prony = None
-    if options.model in ("prony", "auto"):
-        if options.modes == "auto":
-            with named_bar("closed form") as told:
-                prony = viscoelastic.choose_modes(sweep, dense, options.optimizer, told)[0]
-        else:
-            prony = viscoelastic.closed_form(sweep, options.modes, dense, options.optimizer)
-    if options.model == "prony":
-        assert prony is not None
-        return prony
-    return models.choose(sweep, options.model, prony, dense)
-
-
 def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sweep"]:
     """Return a list of fits and the corrected sweep. The list contains the closed-form fit and, by default, the fit of
     the simulation."""
-    from fitting.fits import compressed_sample, instrument, sample_inertia, viscoelastic
+    from fitting.fits import compressed_sample, instrument, sample_inertia
     from fitting.fits.honesty import edges, total_error
-    from fitting.methods import generalised_maxwell
     from fitting.readers import frequency_sweep
     from fitting.rigs import compression
 
@@ -421,25 +402,17 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
         sweep, noted = sample_inertia.taken_off(sweep, *simulation.inertia), sweep.notes
         for note in sweep.notes[len(noted) :]:
             print(f"note: {note}", file=sys.stderr)
-    if options.modes != "auto":
-        viscoelastic.check_modes(sweep, options.modes)
-    dense = generalised_maxwell.refuse_impossible(sweep)
-    writable(options.out, ("fit.json", "fit.png", "fit.h5"))
-    closed = _closed(options, sweep, dense)
+    if options.friction_error:
+        sweep = frequency_sweep.with_friction(sweep, options.friction_error, simulation.radius, simulation.height)
     factors = None
     if options.precompression:
         factors = compression.shares(laws.typical(options.law), options.precompression)
-        closed = compressed_sample.of_compressed_sample(closed, sweep, factors)
-    if options.friction_error:
-        sweep = frequency_sweep.with_friction(sweep, options.friction_error, simulation.radius, simulation.height)
-    closed, corrected = instrument.without_error_of_inertia(closed, sweep, factors)
+    closed, corrected, dense = shared_options.corrected_fit(options, sweep, factors)
     for note in corrected.notes[len(sweep.notes) :]:
         print(f"note: {note}", file=sys.stderr)
     # The error of the gap is included before the warnings are made, because the warnings use the errors.
     if options.gap_error:
         closed = instrument.with_gap_error(closed, options.gap_error / simulation.height)
-    if corrected is not sweep:
-        dense = generalised_maxwell.spectrum(corrected)
     fits = [edges.honest(closed, corrected, dense)]
     heavy = {} if options.density is None else {"density_kg_m3": options.density}
     if options.method != "closed-form":

@@ -5,6 +5,7 @@ the geometry. If the true inertia is I (1 + delta), G' is too small by delta I o
 omega. Without a prior, this term would compensate errors of the model. Here delta has a normal prior around 0 with the
 standard deviation `raw_torque.UNCERTAINTY`. delta is fitted only if the file contains the raw torque or the raw phase.
 The fitted delta is used only if it changes by at most two standard errors when the upper end of the band is left out.
+If this cannot be checked, the moduli are not corrected, and the standard errors contain the whole delta.
 The friction b of the bearing adds b omega / K to G''. The error of b has a normal prior around 0 with the standard
 deviation that the user gives.
 """
@@ -21,7 +22,7 @@ from fitting.fits.viscoelastic import Fit
 from fitting.methods import generalised_maxwell, host, uncertainty
 from fitting.methods.estimate import Estimate, wider
 from fitting.readers import raw_torque
-from fitting.readers.frequency_sweep import Sweep, some
+from fitting.readers.frequency_sweep import Sweep, check_sweep, some
 from fitting.rigs import compression
 
 #: If the standard error of an instrument error, divided by its prior standard deviation, is at least this value, the
@@ -82,6 +83,11 @@ class InstrumentErrors(NamedTuple):
             return np.zeros(len(self.values), bool)
         return np.abs(self.values - self.part) <= 2 * self.part_errors
 
+    @property
+    def unchecked(self) -> bool:
+        """Whether the instrument errors were found, but not without the last half decade of the sweep."""
+        return self.found and self.part is None
+
 
 class Corrected(NamedTuple):
     """Instrument errors that were fitted together with the modes: k errors, in standard deviations of their priors."""
@@ -107,15 +113,26 @@ def nuisances_of(sweep: Sweep) -> list[Nuisance]:
     return out
 
 
+def spectrum_before_correction(sweep: Sweep) -> generalised_maxwell.Spectrum:
+    """Return the spectrum on the dense grid. If the sweep has no data of the instrument, it is refused if no model
+    describes it. Otherwise it may seem impossible only because of an error of the instrument, so `refuse_impossible`
+    must follow after the correction."""
+    if not nuisances_of(sweep):
+        return generalised_maxwell.refuse_impossible(sweep)
+    check_sweep(sweep)
+    return generalised_maxwell.spectrum(sweep)
+
+
 def without_error_of_inertia(fit: Fit, sweep: Sweep, factors: compression.Shares | None = None) -> tuple[Fit, Sweep]:
     """Fit the instrument's errors together with the Prony modes, and return the fit and the corrected sweep.
 
     The fit and the sweep are returned unchanged if the sweep has no data of the instrument. For a model without free
     Prony modes, see `_of_rival_modes`. If one of the errors changes when the upper end of the band is left out, all
-    errors are reported, but the moduli are not corrected for them. If the number of modes was chosen automatically,
-    more modes are tried, too. If the modes were compared with other models, these models are fitted again to the
-    corrected moduli. All these fits use Levenberg-Marquardt, also if the first fit used BFGS. `factors`: as for
-    `of_compressed_sample`, if the fit is that of a compressed sample.
+    errors are reported, but the moduli are not corrected for them. If this cannot be checked, the moduli are not
+    corrected either, but the standard errors contain the errors of the instrument. If the number of modes was chosen
+    automatically, more modes are tried, too. If the modes were compared with other models, these models are fitted
+    again to the corrected moduli. All these fits use Levenberg-Marquardt, also if the first fit used BFGS. `factors`:
+    as for `of_compressed_sample`, if the fit is that of a compressed sample.
     """
     begin, known = time.perf_counter(), nuisances_of(sweep)
     if not known:
@@ -131,6 +148,9 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep, factors: compression.Shares
         errors = _in_both_bands(best, weighed)
         details = fit.details | {"instrument": instrument_numbers(errors, known)}
         warnings, seconds = (*fit.warnings, *_not_corrected(errors, known)), fit.run_time + time.perf_counter() - begin
+        if errors.unchecked:
+            whole = errors.covariance + np.outer(errors.values, errors.values)
+            fit = fit._replace(uncertainty=_with_directions(fit, sweep, known, whole))
         return fit._replace(details=details, warnings=warnings, run_time=seconds), sweep
     corrected = _shifted(weighed, known, best.values)
     corrected = corrected._replace(notes=(*sweep.notes, *_corrections(known, best)))
@@ -216,7 +236,8 @@ def _of_part(fit: Fit, sweep: Sweep) -> tuple[np.ndarray | None, np.ndarray | No
     if len(np.unique(sweep.angular_frequency[kept])) <= len(fit.solution.u) // 2 + 1:
         return None, None
     shorter = some(sweep, kept)
-    part = _errors_of_instrument(viscoelastic.closed_form(shorter, fit.modes), shorter)
+    dense = generalised_maxwell.spectrum(shorter)  # a wrong inertia may make these moduli impossible
+    part = _errors_of_instrument(viscoelastic.closed_form(shorter, fit.modes, dense), shorter)
     return (part.values, np.sqrt(np.diag(part.covariance))) if part.found else (None, None)
 
 
@@ -252,18 +273,20 @@ def _corrections(known: list[Nuisance], best: Corrected) -> list[str]:
 
 
 def used_errors(fit: Fit, sweep: Sweep) -> tuple[list[Nuisance], np.ndarray]:
-    """Return the k instrument errors that were fitted together with the modes, and their values (k,), for which the
+    """Return the k instrument errors that the standard errors of the fit contain, and their values (k,), for which the
     sweep was corrected. The values are in standard deviations of the priors."""
-    told = fit.details.get("instrument")
+    told, known = fit.details.get("instrument"), nuisances_of(sweep)
     if told is None or told["moves_with_the_band"]:
         return [], np.zeros(0)
-    known = nuisances_of(sweep)
+    if told["could_not_be_checked"]:
+        return known, np.zeros(len(known))
     return known, np.array([told[n.reported] / n.unit for n in known])
 
 
 def _not_corrected(errors: InstrumentErrors, known: list[Nuisance]) -> list[str]:
     """Return a warning for each instrument error that changes when the upper end of the band is left out, or one
-    warning if the errors were not found."""
+    warning if the errors were not found. If this change cannot be checked, each error above two standard errors has a
+    warning."""
     out, e = [], np.sqrt(np.diag(errors.covariance))
     if not errors.found:
         each = " and ".join(n.name for n in known)
@@ -275,14 +298,17 @@ def _not_corrected(errors: InstrumentErrors, known: list[Nuisance]) -> list[str]
         ]
     for k in np.flatnonzero(~errors.steady):
         n = known[k]
-        there = "too few points remain to check this error"
+        seems = f"the instrument's {n.name} seems {n.compared(errors.values[k])} (standard error {n.told(e[k])})"
         if errors.part is not None:
-            there = f"the error is then {n.told(errors.part[k])}"
-        out.append(
-            f"the instrument's {n.name} seems {n.compared(errors.values[k])} (standard error {n.told(e[k])}), but not "
-            f"in a fit without the last half decade ({there}). So a misfit of the model poses as {n.name}, and this "
-            "error is not corrected"
-        )
+            out.append(
+                f"{seems}, but not in a fit without the last half decade (the error is then {n.told(errors.part[k])}). "
+                f"So a misfit of the model poses as {n.name}, and this error is not corrected"
+            )
+        elif abs(errors.values[k]) >= 2 * e[k]:
+            out.append(
+                f"{seems}. A fit without the last half decade cannot check this error, so the moduli are not "
+                "corrected, and the standard errors contain this error: measure more points at lower frequencies"
+            )
     return out
 
 
@@ -302,7 +328,8 @@ def instrument_numbers(found: InstrumentErrors, known: list[Nuisance]) -> dict[s
             f"{sd}prior_standard_deviation": n.unit,
             f"{sd}without_last_half_decade": None if found.part is None else n.unit * float(found.part[k]),
         }
-    return out | {"moves_with_the_band": not bool(found.steady.all())}
+    moves = not found.unchecked and not bool(found.steady.all())
+    return out | {"moves_with_the_band": moves, "could_not_be_checked": found.unchecked}
 
 
 def directions(sweep: Sweep, known: list[Nuisance]) -> np.ndarray:

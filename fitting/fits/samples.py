@@ -72,7 +72,7 @@ def fit(
         )
     if model not in models.MODELS:
         raise InputError(f"model = {model!r} is not known: use one of {', '.join(models.MODELS)}")
-    dense = [generalised_maxwell.refuse_impossible(s) for s in sweeps]
+    dense = [instrument.spectrum_before_correction(s) for s in sweeps]
     tried: list[_Candidate] = []
     if model in ("prony", "auto"):
         tried += _modes_for_all(sweeps, dense, modes, progress)
@@ -102,8 +102,8 @@ def _without_error_of_instrument(fit: Fit, sweep: Sweep, dense: Spectrum) -> tup
     """Return the fit with the results of further checks (`edges.honest`), and the sweep. Both are corrected for the
     error of the instrument's inertia, if the sweep has data of the instrument and the model has free Prony modes."""
     fit, corrected = instrument.without_error_of_inertia(fit, sweep)
-    if corrected is not sweep:
-        dense = generalised_maxwell.spectrum(corrected)
+    if instrument.nuisances_of(sweep):
+        dense = generalised_maxwell.refuse_impossible(corrected)
     return edges.honest(fit, corrected, dense), corrected
 
 

@@ -359,8 +359,8 @@ def without_inertia(sweep: Sweep, radius: float | None = None, height: float | N
     empty = int(np.sum(~raw_torque.with_raw_columns(raw)))
     if empty:
         shows += (
-            f" ({empty} of {len(G)} points have an empty cell in the raw columns: for these points, the inertia of "
-            "the other points is used)"
+            f" ({empty} of {len(G)} points have an empty cell in the raw columns, or a torque or displacement of 0: "
+            "for these points, the inertia of the other points is used)"
         )
     note = (
         f"the raw {shows}; at {omega[k] / (2 * np.pi):.3g} Hz, the torque for the inertia is {times:.3g} times the "

@@ -101,8 +101,8 @@ def _plain_unit(unit: str) -> str:
 
 def share(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray], geometry: float | None) -> SampleShare | None:
     """Return the inertia of the instrument and its contribution to the modulus, which the software has subtracted.
-    Returns None if the columns do not determine the inertia, or if its contribution at the highest frequency is below
-    the modulus.
+    Returns None if the columns do not determine the inertia, or if its contribution is below the modulus at the highest
+    frequency that has a value in all raw columns.
 
     Args:
         omega: (n,) [rad/s].
@@ -111,7 +111,7 @@ def share(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray], geometry
         geometry: K [m^3], the torque per Pa and rad. It is needed if there is no sample_torque.
     """
     kept = with_raw_columns(raw)
-    if not {"torque", "angle"} <= set(raw) or not kept.any() or np.any(raw["angle"][kept] == 0):
+    if not {"torque", "angle"} <= set(raw) or not kept.any():
         return None
     w, g, own = omega[kept], G[kept], {q: v[kept] for q, v in raw.items()}
     stiffness = np.abs(own["torque"] / own["angle"])
@@ -125,7 +125,7 @@ def share(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray], geometry
     else:  # the equation for the inertia has two roots; this root is the right one above the resonance
         inertias = (K * g.real + np.sqrt(np.maximum(stiffness**2 - (K * g.imag) ** 2, 0))) / w**2
     inertia = _agreed(w, inertias)
-    if not inertia * omega[-1] ** 2 > K * np.abs(G[-1]):
+    if not inertia * w[-1] ** 2 > K * np.abs(g[-1]):
         return None
     return SampleShare(inertia, inertia * omega**2 / K)
 
@@ -135,8 +135,9 @@ COLUMNS = ("torque", "angle", "phase", "sample_torque")
 
 
 def with_raw_columns(raw: dict[str, np.ndarray]) -> np.ndarray:
-    """Return for each point (n,) whether all raw columns of the instrument have a value."""
-    return np.all([np.isfinite(raw[q]) for q in COLUMNS if q in raw], axis=0)
+    """Return for each point (n,) whether all raw columns of the instrument have a value. A torque or an angle of 0 is
+    no value: some exports write 0 if nothing was measured."""
+    return np.all([np.isfinite(raw[q]) & ((raw[q] != 0) | (q == "phase")) for q in COLUMNS if q in raw], axis=0)
 
 
 def share_by_phase(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray]) -> SampleShare | None:
@@ -144,27 +145,36 @@ def share_by_phase(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray])
     sample size: I omega^2 / K = G' - G'' / tan(phase).
 
     Returns None if there is no phase, or if the phases at the highest frequencies give different inertias. Also returns
-    None if the contribution of the inertia is below the modulus even at the highest frequency.
+    None if the contribution of the inertia is below the modulus even at the highest frequency that has a phase.
     """
-    if "phase" not in raw:
+    kept = np.isfinite(raw.get("phase", np.full(len(omega), np.nan)))
+    if not kept.any():
         return None
-    kept = np.isfinite(raw["phase"])
     with np.errstate(divide="ignore", invalid="ignore"):
         per_square = _agreed(omega[kept], (G.real - G.imag / np.tan(raw["phase"]))[kept] / omega[kept] ** 2)
-    if not per_square * omega[-1] ** 2 > np.abs(G[-1]):
+    if not per_square * omega[kept][-1] ** 2 > np.abs(G[kept][-1]):
         return None
     return SampleShare(np.nan, per_square * omega**2)
 
 
+#: _FEWEST_LED: minimum number of different frequencies whose inertias are compared. _WIDTH_LED: minimum ratio of the
+#: highest to the lowest of these frequencies, if the sweep is wide enough. If the raw columns contain no inertia and no
+#: phase, the root that `share` uses is 2 K G' / omega^2. At frequencies that differ by less, it would seem constant.
+_FEWEST_LED, _WIDTH_LED = 3, 1.1
+
+
 def _agreed(omega: np.ndarray, values: np.ndarray) -> float:
     """Return the median inertia at the highest frequencies, or NaN if the inertias at these frequencies differ by a
-    tenth or more.
+    tenth or more, or if there are too few different frequencies. Points with the same frequency are averaged first.
 
     At these frequencies the contribution of the inertia is largest, so the inertia is known best. At other frequencies
     the inertia is a small difference of large numbers.
     """
-    if not len(omega):
+    different, place = np.unique(omega, return_inverse=True)
+    if len(different) < _FEWEST_LED:
         return np.nan
-    led = np.argsort(omega)[-max(3, len(omega) // 6) :]
-    value, apart = float(np.median(values[led])), np.ptp(values[led])
+    means = np.bincount(place, values) / np.bincount(place)
+    below = int(np.sum(different <= different[-1] / _WIDTH_LED))  # the last of these frequencies is compared, too
+    led = means[max(0, min(len(means) - max(_FEWEST_LED, len(means) // 6), below - 1)) :]
+    value, apart = float(np.median(led)), np.ptp(led)
     return value if value > 0 and apart < 0.1 * value else np.nan
