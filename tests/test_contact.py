@@ -83,6 +83,19 @@ def test_a_pressed_cube_sinks_by_pressure_over_stiffness(order):
     assert np.allclose(slope, 50.0 / 1e12, rtol=1e-6)
 
 
+@pytest.mark.ci
+def test_a_body_just_above_a_plane_counts_as_lying_on_it():
+    """The check accepted a gap of 1e-7 of a triangle as contact, but the stiffness did not: the run failed."""
+    scene = lying()
+    heavy = lj.Body(density=1000.0, gravity=jnp.array([0.0, 0.0, -1.0]))
+    plane = replace(scene.physics[0], position=jnp.array([0.0, 0.0, -2e-9]))
+    scene = replace(scene, traction=(), body=heavy, physics=(plane,))
+    lj.check_scene(scene)
+    found = lj.simulate(scene).check()
+    assert int(found.statistics.iterations[0]) < 10
+    np.testing.assert_allclose(lj.obstacle_forces(scene, found).force[0, -1], [0, 0, -1000.0 * SIDE**3], atol=1e-7)
+
+
 @pytest.mark.parametrize(("ratio", "volumetric", "depth"), [(3.0, "element", 5e-5), (1e3, "mixed", 2e-5)])
 @pytest.mark.slow
 def test_a_sphere_on_a_layer_takes_the_force_of_its_integral_equation(ratio, volumetric, depth, verified):

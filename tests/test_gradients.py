@@ -323,3 +323,12 @@ def test_a_second_derivative_of_a_run(kind):
     assert found == pytest.approx(expected, rel=1e-5)
     other = float(jax.hessian(size)(770.0))
     assert np.isnan(other) or other == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("once", [{"newton": "one_step"}, {"newton_iterations": 1}])
+def test_a_step_of_one_solve_has_no_gradient(once):
+    """A derivative that was wrong by percents was returned without a warning."""
+    scene = _scene("static")
+    scene = replace(scene, solve=replace(scene.solve, tolerance=0.4, **once))
+    with pytest.raises(lj.InputError, match="has no correct derivatives: use newton = 'converged'"):
+        lj.value_and_gradient(_sum, scene, {"law.mu": 770.0})

@@ -16,7 +16,9 @@ from liverjax.core.struct import replace
 from liverjax.jobs import output, waves
 from liverjax.mesh.tetrahedra import with_points
 from liverjax.physics.attached.ligament import Ligament
+from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.physics.porosity import Inlet
+from liverjax.physics.prescribed import free_degrees
 from liverjax.scenes.scene_file import scene_from
 from liverjax.scenes.springpots import springpot_factors
 from liverjax.simulation.equations import forces_at
@@ -241,3 +243,22 @@ def test_forces_of_a_relaxed_body_have_the_form_of_volumes_of_the_run():
     run = replace(scene, law=relaxed, viscosity=None, solve=lj.Solve(volumetric="element"))
     reactions = np.array(forces_at(prepared(run), x))
     assert waves._of_rest(scene, x, reactions, "--about run") == []
+
+
+def test_a_body_on_an_obstacle_has_rested():
+    """The contact forces at free components, and at nodes that are also fixed, were taken for unrelaxed stress."""
+    mesh, law = lj.shapes.box((0.1, 0.1, 0.1), (1, 1, 1)), lj.laws.NeoHookean(mu=5e3, bulk=2e4)
+    plane = Obstacle(
+        triangles=jnp.asarray(lj.boundary.boundary_triangles(mesh, mesh.node_sets["z_min"])),
+        position=jnp.array([0.0, 0.0, 2e-4]),
+    )
+    scene = lj.Scene(mesh=mesh, law=law, fixed=(lj.Fixed(nodes=mesh.node_sets["x_min"]),), physics=(plane,))
+    x = mesh.points + 1e-4 * mesh.points[:, :1]
+    # Without `fixed`, the forces at nodes that touch the obstacle contain its push.
+    forces = np.asarray(forces_at(prepared(replace(scene, fixed=())), x))
+    reactions = np.where(np.asarray(free_degrees(mesh, scene.fixed, ())) > 0, 0.0, forces)
+    assert np.abs(forces[reactions == 0]).max() > np.abs(reactions).max() / 2
+    assert waves._of_rest(scene, x, reactions, "--about run") == []
+    assert waves._of_rest(scene, x, 0.9 * reactions, "--about run")
+    sliding = replace(scene, fixed=(lj.Fixed(nodes=mesh.node_sets["x_min"], axes="x"),))
+    assert waves._of_rest(sliding, x, reactions * np.array([1.0, 0.0, 0.0]), "--about run") == []

@@ -156,6 +156,8 @@ def test_a_heavy_body_under_a_pressed_obstacle_is_no_harmonic_motion(tmp_path, c
         ("frequencies = [60.0]\n", ["--png"], "--png cannot be used with [solve] kind = 'harmonic'"),
         ("frequencies = [60.0]\n", ["--every", "0"], "--every cannot be used with [solve] kind = 'harmonic'"),
         ("frequencies = [60.0]\ndt = 0.01\n", [], "[solve] dt cannot be used with [solve] kind = 'harmonic'"),
+        ('frequencies = [60.0]\nnewton = "one_step"\n', [], "newton = 'one_step' has no effect with kind"),
+        ('frequencies = [60.0]\nrobust = "projected"\n', [], "robust = 'projected' has no effect with kind"),
         ("frequencies = [60.0]\n", ["--about", "none.h5"], "none.h5 does not exist"),
         ("frequencies = [60.0]\n", ["--about", __file__], "contains no positions"),
     ],

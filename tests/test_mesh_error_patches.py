@@ -8,12 +8,14 @@ import pytest
 import liverjax as lj
 from liverjax.elements import mjed, reference
 from liverjax.mesh.promotion import cubic
+from liverjax.mesh.tetrahedra import with_points
 from liverjax.physics.base import Free, Step
 from liverjax.physics.elastic_support import ElasticSupport
 from liverjax.physics.prescribed import free_places, prescribed
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.scenes.enriched import enriched
 from liverjax.scenes.refined import on_refined_mesh
+from liverjax.simulation.equations import free_directions
 from liverjax.solvers import attached
 from liverjax.tensors.matrices import deformation_gradient, determinant
 
@@ -234,3 +236,23 @@ def test_pressure_on_a_closed_surface_of_order_3_is_the_change_of_volume():
     assert abs(work(x) + 3.0 * swept) < 1e-12 * abs(swept)
     bent = jax.jvp(lambda x: jax.jvp(volume, (x,), (first,))[1], (x,), (second,))[1]
     assert abs(jax.jvp(work, (x,), (second,))[1] + 3.0 * bent) < 1e-12 * abs(bent)
+
+
+@pytest.mark.parametrize("richer", [enriched, lambda scene: on_refined_mesh(scene)[0]])
+def test_a_sliding_support_beside_another_support_leaves_no_node_free(richer):
+    """New nodes between a sliding support and another support were free."""
+    mesh = lj.shapes.box((0.1, 0.05, 0.05), (4, 2, 2))
+    x, floor = np.asarray(mesh.points), np.asarray(mesh.node_sets["z_min"])
+    left, right = floor[x[floor, 0] <= 0.051], floor[x[floor, 0] > 0.051]
+    law = lj.laws.NeoHookean(mu=770.0, bulk=2200.0)
+    turn = np.array([[np.cos(0.3), 0.0, np.sin(0.3)], [0.0, 1.0, 0.0], [-np.sin(0.3), 0.0, np.cos(0.3)]])
+    turned = with_points(mesh, jnp.asarray(x @ turn.T))
+    for own, kind in ((mesh, {"axis": "z"}), (turned, {"normal": jnp.asarray(turn[:, 2])})):
+        one, other = (SlidingSupport(nodes=nodes, **kind) for nodes in (left, right))
+        clamp = (lj.Fixed(nodes=left),)
+        for fixed, physics in ((clamp, (other,)), ((), (one, other))):
+            rich = richer(lj.Scene(mesh=own, law=law, fixed=fixed, physics=physics))
+            free = free_directions(rich)
+            normal = turn[:, 2] if free.normals is not None else np.array([0.0, 0.0, 1.0])
+            moved = np.abs(np.asarray(free.vectors(jnp.tile(normal, (len(rich.mesh.points), 1)))) @ normal)
+            assert np.array_equal(moved < 1e-9, np.abs(np.asarray(rich.mesh.points) @ normal) < 1e-9)

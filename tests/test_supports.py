@@ -11,7 +11,7 @@ import liverjax as lj
 from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
-from liverjax.jobs.reactions import reaction_table
+from liverjax.jobs.reactions import held_forces, reaction_table
 from liverjax.mesh.tetrahedra import with_points
 from liverjax.physics.base import Free, Step
 from liverjax.physics.elastic_support import ElasticSupport
@@ -349,3 +349,15 @@ def test_a_normal_in_a_tuple_can_be_unknown():
     for values in ({"support.0.normal": slide.normal}, {"support.0.normal.0": 0.0}):
         found = jax.eval_shape(lambda at: lj.simulate(lj.with_parameters(scene, at)).positions, values)
         assert found.shape[1:] == mesh.points.shape
+
+
+def test_a_reaction_at_a_node_of_several_supports_counts_once():
+    """An oblique support in front of a support along an axis took the force of the node a second time."""
+    mesh, normal = box(), jnp.array([1.0, 0.0, 1.0]) / jnp.sqrt(2.0)
+    slides = (SlidingSupport(nodes=jnp.array([0]), normal=normal), SlidingSupport(nodes=jnp.array([0]), axis="z"))
+    scene = lj.Scene(mesh=mesh, law=LAW, fixed=(lj.Fixed(nodes=jnp.array([0]), axes="x"),), physics=slides)
+    reactions = np.zeros((1, len(mesh.points), 3))
+    reactions[0, 0] = 3.0, 0.0, 5.0
+    found = {name: force[0].tolist() for name, force in held_forces(scene, reactions).items()}
+    assert found == {"fixed.0": [3.0, 0.0, 0.0], "support.0": [0.0, 0.0, 0.0], "support.1": [0.0, 0.0, 5.0]}
+    assert list(found) == ["fixed.0", "support.0", "support.1"]

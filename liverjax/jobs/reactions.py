@@ -61,21 +61,21 @@ def held_forces(scene: Scene, reactions: np.ndarray) -> dict[str, np.ndarray]:
         for k, part in enumerate(getattr(scene, kind)):
             axes = [AXES.index(axis) for axis in part.axes]
             found[f"{kind}.{k}"] = along(np.unique(np.asarray(part.nodes)), axes)
-    held = taken.copy()
-    for k, place in enumerate(scene.named("support")):
-        physics = scene.physics[place]
-        if not isinstance(physics, SlidingSupport):
-            continue
-        nodes = np.unique(np.asarray(physics.nodes))
+    supports = [(f"support.{k}", scene.physics[place]) for k, place in enumerate(scene.named("support"))]
+    slides = {name: physics for name, physics in supports if isinstance(physics, SlidingSupport)}
+    for name, physics in slides.items():
         if physics.axis:
-            found[f"support.{k}"] = along(nodes, [AXES.index(physics.axis)])
+            found[name] = along(np.unique(np.asarray(physics.nodes)), [AXES.index(physics.axis)])
+    for name, physics in slides.items():
+        if physics.axis:
             continue
-        # If fixed or displaced conditions already constrain a node along every axis in which the normal has a
-        # component, the sliding support gets no force at this node.
-        normal = np.asarray(physics.normal)
-        loose = nodes[~held[nodes][:, np.abs(normal) > 1e-12].all(axis=1)]
-        found[f"support.{k}"] = (reactions[:, loose] @ normal).sum(axis=1)[:, None] * normal
-    return found
+        # If other conditions already constrain a node along every axis in which the normal has a component, the sliding
+        # support gets no force at this node.
+        nodes, normal = np.unique(np.asarray(physics.nodes)), np.asarray(physics.normal)
+        loose = nodes[~taken[nodes][:, np.abs(normal) > 1e-12].all(axis=1)]
+        found[name] = (reactions[:, loose] @ normal).sum(axis=1)[:, None] * normal
+    order = [name for name in found if name not in slides]
+    return {name: found[name] for name in (*order, *slides)}
 
 
 def spring_forces(scene: Scene, result: Result) -> dict[str, jax.Array]:

@@ -18,7 +18,6 @@ from liverjax.core.struct import replace
 from liverjax.jobs.output import read_by_step
 from liverjax.jobs.reactions import held_forces
 from liverjax.mesh.files import meshio_cells
-from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene import Scene, Solve
@@ -131,8 +130,8 @@ def _nodes_under_traction_of(text: str, scene: Scene) -> np.ndarray:
 def _of_rest(scene: Scene, x: jax.Array, reactions: np.ndarray, name: str) -> list[str]:
     """Return a warning if the reactions (V, 3) [N] of a run differ from those of the relaxed body at the positions x.
 
-    Nodes whose reaction is 0 or not known (NaN) are not compared. If the reactions differ, the stress of the run also
-    differs from the relaxed stress. There is no warning for a porous body.
+    Components that are 0 or not known (NaN) in the run are not compared. If the reactions differ, the stress of the run
+    also differs from the relaxed stress. There is no warning for a porous body.
     """
     norms = np.linalg.norm(reactions, axis=1)
     pulled = np.nan_to_num(norms)
@@ -143,9 +142,10 @@ def _of_rest(scene: Scene, x: jax.Array, reactions: np.ndarray, name: str) -> li
             f"whether the stress in the state of {name} is relaxed was not checked, because a traction of that run "
             "acts at all nodes with a reaction"
         ]
-    at = pulled > 0.01 * pulled.max()
-    # Membranes, ligaments and springs also pull at fixed nodes. Obstacles and sliding supports do not.
-    pulling = tuple(own for own in scene.physics if not isinstance(own, Obstacle | SlidingSupport))
+    # A free component of a reaction is 0.
+    at = (pulled > 0.01 * pulled.max())[:, None] & (reactions != 0)
+    # Membranes, ligaments, springs and obstacles also pull or push at fixed nodes. Sliding supports do not.
+    pulling = tuple(own for own in scene.physics if not isinstance(own, SlidingSupport))
     still = resting(replace(by_element(scene), traction=(), fixed=(), displaced=(), physics=pulling))
     still = replace(still, solve=Solve(volumetric=still.solve.volumetric))
     relaxed = np.asarray(jax.jit(forces_at)(prepared(still), x))

@@ -34,6 +34,7 @@ from liverjax.reduced.physics.supports import identity_of_supports, refuse_other
 from liverjax.scenes.by_element import law_of_elements
 from liverjax.scenes.regions import laws_of
 from liverjax.scenes.scene import Scene, numbers_at, with_parameters
+from liverjax.simulation import automatic
 from liverjax.tensors.matrices import Matrix, deformation_gradient
 from liverjax.tensors.places import taken
 
@@ -172,7 +173,7 @@ def refuse_unknown_physics(scene: Scene) -> None:
         InputError: the scene has a viscosity per element, regions with a separate viscosity or another kind of law,
             inlets of a fluid, physics objects other than supports, a mesh of the loaded body, or pressures that follow
             the surface. Other reasons are averaged or mixed volumes, a consistent mass matrix, viscosity without a time
-            step, a precision other than "float64", or a setting of newton other than "converged".
+            step, a precision other than "float64", newton = "one_step", or only one Newton iteration.
     """
     by_element = scene.viscosity is not None and jnp.asarray(scene.viscosity.ratios).ndim == 2
     if by_element or any(region.viscosity for region in scene.region):
@@ -191,16 +192,17 @@ def refuse_unknown_physics(scene: Scene) -> None:
     refuse_other_physics(scene)
     if follows(scene.traction):
         raise InputError("a reduced model cannot have a pressure that follows the surface: give traction.value instead")
-    if scene.solve.volumetric != "element":
+    if automatic.form_of_volumes(scene) != "element":
         raise InputError(
             f"[solve] volumetric = {scene.solve.volumetric!r} does not work in reduced models: use "
             "volumetric = 'element'"
         )
     if scene.body is not None and scene.body.mass != "lumped":
         raise InputError(f"[body] mass = {scene.body.mass!r} does not work in reduced models: use mass = 'lumped'")
-    if scene.solve.newton != "converged":
+    if automatic.is_one_step(scene.solve):
         raise InputError(
-            f"[solve] newton = {scene.solve.newton!r} does not work in reduced models: use newton = 'converged'"
+            "[solve] newton = 'one_step' (or newton_iterations = 1) does not work in reduced models: use newton = "
+            "'converged' and more iterations"
         )
     if scene.solve.precision != "float64":
         raise InputError(

@@ -1,5 +1,6 @@
 """Supports and motions of the new nodes between two entries, for example between two `[[fixed]]` entries of one clamp.
 
+A sliding support is also such an entry.
 Each entry of a scene gets the new nodes between its own nodes. On a strip of triangles between two entries, the run
 prescribes the motion of all nodes. So the new nodes on this strip move as these triangles do in the run. Between two
 entries with given pressures of the fluid, the new nodes get the pressures of the run.
@@ -15,10 +16,14 @@ from liverjax.core.struct import replace
 from liverjax.mesh.adjacency import node_numbers
 from liverjax.mesh.promotion import middles_between
 from liverjax.mesh.selection import AXES
+from liverjax.physics.base import Physics
 from liverjax.physics.porosity import Inlet, Porosity
 from liverjax.physics.prescribed import Displaced, Fixed
+from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.scenes.scene import Scene
 
+#: Two normals are parallel if the cosine of their angle differs from 1 or -1 by less than this value.
+_SAME_NORMAL = 1e-12
 #: Weights of old nodes at a new node are roundoff if they are below this value.
 _SOME_WEIGHT = 1e-9
 
@@ -68,7 +73,8 @@ def joined_entries(
                 by = field(sum((_amounts(e, axis, where) for e, where in parts), jnp.zeros(len(owner))))[nodes]
                 displaced = (*displaced, _along_axis(first, axis, nodes, by.astype(old.mesh.points.dtype)))
     fixed = (Fixed(nodes=node_numbers(nodes), axes=axes) for nodes, axes in still.items())
-    return replace(made, fixed=(*made.fixed, *fixed), displaced=displaced)
+    made = replace(made, fixed=(*made.fixed, *fixed), displaced=displaced)
+    return replace(made, physics=_joined_slides(old, made, between))
 
 
 def joined_inlets(old: Scene, made: Porosity) -> tuple[Inlet, ...]:
@@ -110,8 +116,41 @@ def _given_pressures(porosity: Porosity) -> list[tuple[Inlet | None, np.ndarray]
 
 
 def _entries_along(scene: Scene, axis: str) -> list[Fixed | Displaced]:
-    entries: tuple[Fixed | Displaced, ...] = (*scene.fixed, *scene.displaced)
+    """Return the entries that constrain an axis. A sliding support along this axis counts as a fixed entry."""
+    supports = [own for own in scene.physics if isinstance(own, SlidingSupport) and own.axis == axis]
+    slides = [Fixed(nodes=own.nodes, axes=axis) for own in supports]
+    entries: tuple[Fixed | Displaced, ...] = (*slides, *scene.fixed, *scene.displaced)
     return [entry for entry in entries if axis in entry.axes]
+
+
+def _joined_slides(old: Scene, made: Scene, between: Callable[[list[np.ndarray]], np.ndarray]) -> tuple[Physics, ...]:
+    """Return the physics of `made`, with more nodes for its sliding supports that have an oblique normal.
+
+    A new node gets such a support if all old nodes around it stay in planes with this normal, because of sliding
+    supports with equal normals or of fixed entries.
+    """
+    physics = list(made.physics)
+    oblique = {
+        k: (own, now)
+        for k, (own, now) in enumerate(zip(old.physics, made.physics, strict=True))
+        if isinstance(own, SlidingSupport) and isinstance(now, SlidingSupport) and not own.axis
+        if not isinstance(own.normal, jax.core.Tracer)
+    }
+    normals = {k: np.asarray(own.normal, float) for k, (own, _) in oblique.items()}
+    taken = [np.asarray(now.nodes) for _, now in oblique.values()]
+    for k, normal in normals.items():
+        alike = [j for j in oblique if abs(abs(np.dot(normal, normals[j])) - 1) < _SAME_NORMAL]
+        along = {axis for axis, part in zip(AXES, normal, strict=True) if abs(part) > _SOME_WEIGHT}
+        groups = [np.asarray(oblique[j][0].nodes) for j in alike]
+        groups += [np.asarray(entry.nodes) for entry in old.fixed if along <= set(entry.axes)]
+        if k != alike[0] or len(groups) < 2:
+            continue
+        held = [np.asarray(entry.nodes) for axis in along for entry in _entries_along(made, axis)]
+        new = np.setdiff1d(between(groups), np.concatenate([*taken, *held]))
+        if len(new):
+            own = oblique[k][1]
+            physics[k] = replace(own, nodes=node_numbers(np.concatenate([np.asarray(own.nodes), new])))
+    return tuple(physics)
 
 
 def _clocks(own: list[Fixed | Displaced]) -> tuple[np.ndarray, list[Displaced]]:

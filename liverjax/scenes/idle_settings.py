@@ -41,6 +41,12 @@ def refuse_idle(content: Content) -> None:
     for place, key in (("solve", "dt"), ("solve", "steps"), ("porosity", "initial_pressure")):
         if motion == "harmonic" and key in content.get(place, {}):
             raise InputError(f"[{place}] {key} cannot be used with [solve] kind = 'harmonic': remove this key")
+    for key, idle in (("newton", "converged"), ("robust", "off")):
+        if motion == "harmonic" and solve.get(key, idle) != idle:
+            raise InputError(
+                f"[solve] {key} = {solve[key]!r} has no effect with kind = 'harmonic', also not on the state of rest: "
+                "remove this key"
+            )
     if motion == "harmonic" and content.get("body", {}).get("mass") == "lumped":
         raise InputError(
             "[body] mass = 'lumped' cannot be used with [solve] kind = 'harmonic', which uses consistent masses: "

@@ -18,7 +18,7 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
 from liverjax.scenes.by_element import by_element
 from liverjax.scenes.checks.choices import check_volumetric
-from liverjax.scenes.scene import Scene, with_parameters
+from liverjax.scenes.scene import Scene, Solve, with_parameters
 
 LARGEST, STIFFEST, THINNEST = 10_000, 1e3, 1e-3
 #: A body with at most `SMALL` elements is small. "auto" chooses a factorisation for a small body if its bulk modulus is
@@ -32,11 +32,16 @@ def chosen(scene: Scene) -> Scene:
     If `newton_iterations` is 1, `newton` is set to "one_step".
     """
     solve = _with_form(scene).solve
-    if solve.newton_iterations == 1:
+    if is_one_step(solve):
         solve = replace(solve, newton="one_step")
     if solve.linear_solver == "auto":
         solve = replace(solve, linear_solver=linear_solver(replace(scene, solve=solve)))
     return replace(scene, solve=solve)
+
+
+def is_one_step(solve: Solve) -> bool:
+    """Return whether a step has only one linear solve, because of `newton` or of `newton_iterations`."""
+    return solve.newton == "one_step" or solve.newton_iterations == 1
 
 
 def with_solver(scene: Scene, rows: Iterable[Mapping[str, object]]) -> Scene:

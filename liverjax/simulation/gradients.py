@@ -58,13 +58,18 @@ def value_and_gradient(
             no memory for the steps, but costs one run per parameter.
 
     Raises:
-        InputError: `mode` or `store` is unknown; `at` is empty; the scene has no number with one of the names; or
-            `simulate` would raise InputError.
+        InputError: `mode` or `store` is unknown; `at` is empty; a step has only one Newton iteration; the scene has no
+            number with one of the names; or `simulate` would raise InputError.
     """
     if mode not in MODES:
         raise InputError(f"mode = {mode!r} is not known: use {' or '.join(MODES)}")
     if not at:
         raise InputError("no parameters are given for the derivatives: give e.g. {'law.mu': 770.0}")
+    if automatic.is_one_step(scene.solve):
+        raise InputError(
+            "[solve] newton = 'one_step' (or newton_iterations = 1) has no correct derivatives: use newton = "
+            "'converged' and more iterations"
+        )
     gradient_checkpoints.number_kept(store, scene.solve.steps)
     values = {name: jnp.asarray(value, float) for name, value in at.items()}
     numbers = {name: value for name, value in values.items() if name != START}

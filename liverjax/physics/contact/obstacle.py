@@ -39,8 +39,9 @@ from liverjax.solvers.attached import Attached
 #: Stiffness of the contact, divided by the stiffness of a layer of the body's material. The layer is as thick as a
 #: triangle is wide.
 HARDNESS = 100.0
-#: A point counts as touching if its distance, divided by the size of a triangle, is at most this value.
-_TOUCHING = 1e-9
+#: A point counts as touching if its distance, divided by the size of a triangle, is at most `_TOUCHING`. If the
+#: obstacle presses on no point, the limit is `_NEAR`: nodes of files in float32 have roundoff.
+_TOUCHING, _NEAR = 1e-9, 1e-6
 #: Weights (Q,) and barycentric coordinates (3, Q) of Q = 3 contact points of a triangle (integration rule of degree 2).
 _POINTS = np.full(3, 1 / 3), np.full((3, 3), 1 / 6) + 0.5 * np.eye(3)
 
@@ -156,7 +157,7 @@ class Obstacle(Physics):
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
         """Return the nodes (n,) of triangles that touch the obstacle at the beginning, and the normals (n, 3) there."""
         d = _distances(self, mesh, mesh.points, self.displacement(0, 1, 0.0))
-        near = np.asarray(d.value <= 1e3 * _TOUCHING * jnp.sqrt(_triangle_areas(self, mesh))[None])
+        near = np.asarray(d.value <= _NEAR * jnp.sqrt(_triangle_areas(self, mesh))[None])
         _, touching = np.nonzero(near)
         nodes = np.asarray(self.triangles)[touching]
         normals = np.stack([np.asarray(n)[near] for n in d.normal], axis=-1)
@@ -277,11 +278,21 @@ def contact_force(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Ar
 def depths(d: Distance, near: jax.Array) -> jax.Array:
     """Return the signed distances (Q, m) [m] of points inside the obstacle (negative), and 0 for other points.
 
-    Points nearer than `near` (m,) [m] count as pressed, so they have a stiffness. `jnp.minimum(d.value, 0)` is not
+    Points that touch (see `touches`) count as pressed, so they have a stiffness. `jnp.minimum(d.value, 0)` is not
     used, because its derivative in JAX is only half of the correct value at a point that just touches.
     """
     pressed = d.value - jax.lax.stop_gradient(jnp.maximum(d.value, 0.0))
-    return jnp.where(d.value <= near[None], pressed, 0.0)
+    return jnp.where(touches(d, near), pressed, 0.0)
+
+
+def touches(d: Distance, near: jax.Array) -> jax.Array:
+    """Return whether points (Q, m) with distances `d` are inside the obstacle, or near enough to count as touching.
+
+    `near` (m,) [m] is the maximum distance of such a point. If the obstacle presses on no point, the maximum distance
+    is larger (see `_NEAR`).
+    """
+    lying = jnp.all(d.value >= -near[None])
+    return d.value <= jnp.where(lying, _NEAR / _TOUCHING, 1.0) * near[None]
 
 
 def shared_out(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, pushes: jax.Array) -> jax.Array:
@@ -358,11 +369,11 @@ def _distances(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array
 
 def just_touching(obstacle: Obstacle, mesh: TetMesh, d: Distance) -> jax.Array:
     """Return whether points (Q, m) with distances `d` are inside the obstacle, or near enough to count as touching."""
-    return d.value <= touching_distance(obstacle, mesh)[None]
+    return touches(d, touching_distance(obstacle, mesh))
 
 
 def touching_distance(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
-    """Return the maximum distance (m,) [m] of a point that counts as touching, for each of m triangles."""
+    """Return the maximum distance (m,) [m] of a point that counts as touching a pressed surface of m triangles."""
     return _TOUCHING * jnp.sqrt(_triangle_areas(obstacle, mesh))
 
 
@@ -415,7 +426,7 @@ def touches_without_pressure(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) ->
     The obstacle is at its initial position, and x (V, 3) are the positions of the body.
     """
     d = _distances(obstacle, mesh, x, obstacle.displacement(0, 1, 0.0))
-    nothing = d.value >= -_TOUCHING * jnp.sqrt(_triangle_areas(obstacle, mesh))[None]
+    nothing = d.value >= -touching_distance(obstacle, mesh)[None]
     return bool(just_touching(obstacle, mesh, d).any() & nothing.all())
 
 
