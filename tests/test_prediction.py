@@ -140,6 +140,19 @@ def test_the_error_of_a_noisy_test_is_its_noise():
     assert "in the band have decayed into the noise" in prediction.sentence(tail)
 
 
+def test_decayed_values_are_not_in_the_percentage():
+    """Of a relaxation test that is 1.3 times too stiff, 61 % of 120 values were in the interval: the decayed ones."""
+    rng, omega, at = np.random.default_rng(3), 2 * np.pi * np.geomspace(0.005, 10, 40), np.linspace(0, 30, 121)
+    fluid = Maxwell(np.float64(1000.0), np.array([0.5, 0.5]), np.array([2.0, 0.1]))
+    G = generalised_maxwell.moduli(fluid, omega) * (1 + 0.01 * rng.standard_normal((2, 40)))
+    stress = 1300 * (0.5 * np.exp(-at / 0.1) + 0.5 * np.exp(-at / 2)) + rng.standard_normal(121)
+    fitted = Sweep(omega, *G)
+    test = TimeTest("relaxation", at, np.ones(121), stress, at > 0, source="relaxation.csv")
+    found = prediction.predict(viscoelastic.closed_form(fitted, 2), fitted.resolved, test)
+    assert found.inside.sum() == 120 and 20 < found.counted.sum() < 50 and found.covered < 0.2
+    assert f"of {found.counted.sum()} numbers lie in the 95 % interval" in prediction.sentence(found)
+
+
 def test_storage_and_loss_of_a_predicted_sweep_have_noise_of_their_own():
     """One noise between those of G' and of G'' was used for both, so a correct prediction missed a fifth of the
     values."""

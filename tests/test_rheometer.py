@@ -1,9 +1,12 @@
 """Reading sweeps: units, instruments' exports, and one-line messages for everything that cannot be read."""
 
+import json
+
 import numpy as np
 import pytest
 from conftest import ROOT
 
+from fitting.__main__ import main
 from fitting.master.temperature_sweeps import joined
 from fitting.readers.frequency_sweep import Sweep
 from fitting.readers.rheometer import read_sweep
@@ -286,3 +289,20 @@ def test_deviations_are_smoothed_in_each_of_several_joined_sweeps():
     whole = joined(own)
     assert np.allclose(whole.deviations[0], whole.storage_sd, rtol=0.01)
     assert whole.sd_before and not whole.sd_estimated and whole.source == "0.csv, 1.csv"
+
+
+@pytest.mark.parametrize("samples", [1, 3])
+def test_moduli_of_tension_have_the_size_error_of_a_force(tmp_path, samples):
+    """They had the error of torque over twist, with the fourth power of the radius."""
+    omega, files = np.geomspace(0.1, 100, 20), []
+    for k in range(samples):
+        E = 3000 * (1 + 0.02 * k) * (0.5 + 0.5j * omega / (1 + 1j * omega))
+        E = E * (1 + 0.01 * np.random.default_rng(k).standard_normal(20))
+        files.append(str(tmp_path / f"{k}.csv"))
+        head = "angular_frequency_rad_s,E' [Pa],E'' [Pa]"
+        np.savetxt(files[-1], np.column_stack([omega, E.real, E.imag]), delimiter=",", header=head, comments="")
+    ask = ["--method", "closed-form", "--modes", "1", "--radius", "0.001", "--height", "0.02"]
+    assert main([*files, *ask, "--out", str(tmp_path / "out")]) == 0
+    content = json.loads((tmp_path / "out" / "fit.json").read_text())
+    for own in content.get("samples", [content]):
+        assert own["details"]["geometry_error"] == pytest.approx(np.hypot(50e-6 / 0.02, 2 * 10e-6 / 0.001))

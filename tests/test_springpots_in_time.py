@@ -16,6 +16,7 @@ from fitting.__main__ import main
 from fitting.fits import posterior
 from fitting.fits import time_tests as time_fits
 from fitting.fits.families import springpots_in_time
+from fitting.fits.together import common_fit
 from fitting.methods import generalised_maxwell, springpots, time_response
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers import time_tests
@@ -255,6 +256,19 @@ def test_a_fluid_is_no_solid_by_chance():
     rows = {row["model"]: row["above_the_lowest"] for row in fit.details["tried"]}
     assert fit.kind.name == "prony_fluid" and 0 <= rows["prony"] < rows["prony_fluid"] < rows["prony"] + 6
     assert min(rows.values()) == 0 and set(rows) > {"spectrum", "springpot"}
+
+
+def test_a_fluid_in_two_tests_is_no_solid_by_chance():
+    """Several tests together chose the solid, whose criterion is lower by chance, and `auto` did not show the fluid."""
+    creep, rng = creep_of_burgers(0.0), np.random.default_rng(1)
+    omega = np.geomspace(0.5, 50, 12)
+    compliance = 1 / 800 + 1 / (1600j * omega) + 1 / (500 * (1 + 3j * omega))
+    G = (1 / compliance) * (1 + 0.01 * rng.standard_normal(12))
+    fit = common_fit.fit([Sweep(omega, G.real, G.imag), creep], 2)
+    (own,) = (row for row in fit.tried if row["model"] == "prony_fluid")
+    table = springpots_in_time._with_other_kind([own], fit, fit.tried)
+    rows = {row["model"]: row["above_the_lowest"] for row in table}
+    assert fit.kind.name == "prony_fluid" and 0 <= rows["prony"] < rows["prony_fluid"] < rows["prony"] + 6
 
 
 def test_a_fluid_is_told_that_a_solid_fits_better():

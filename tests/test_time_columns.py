@@ -3,12 +3,14 @@ test.
 """
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from test_time_tests import write
 
 from fitting.__main__ import main
+from fitting.commands.together import errors_of_sizes
 from fitting.readers.tables.time_columns import read_columns
 from fitting.readers.time_tests import Sample, read_time_test
 from liverjax.core.errors import InputError
@@ -60,6 +62,16 @@ def test_quantities_of_tension_are_made_those_of_shear(header, quantity, factor,
     assert any("G = E / 3" in note for note in notes) == (factor != 1e3 and factor is not None)
     if quantity == "stress":
         assert np.allclose(columns["strain"], 0.01 * (5 + np.arange(1, 9)))
+
+
+@pytest.mark.parametrize("name", ["E(t) [Pa]", "tensile strain,tensile stress [Pa]", "G(t) [Pa]"])
+def test_only_quantities_of_shear_have_the_size_error_of_a_torque(name, tmp_path):
+    """Moduli of tension had the error of torque over twist, with the fourth power of the radius."""
+    rows = "".join(f"{k},{0.1 if ',' in name else 900 - k},{900 - k}\n" for k in range(1, 9))
+    (tmp_path / "t.csv").write_text(f"time_s,{name}\n{rows}")
+    test = read_time_test(tmp_path / "t.csv", "relaxation", ramp=0)
+    expected = np.hypot(50e-6 / 0.02, (4 if name[0] == "G" else 2) * 10e-6 / 0.001)
+    assert errors_of_sizes(SimpleNamespace(radius=0.001, height=0.02), [test]) == pytest.approx([expected])
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,8 @@ import liverjax as lj
 from fitting.fits import sample_inertia, simulated_rheometer, viscoelastic
 from fitting.methods import generalised_maxwell
 from fitting.methods.generalised_maxwell import Maxwell
-from fitting.readers.rheometer import Sweep
+from fitting.readers.frequency_sweep import with_friction
+from fitting.readers.rheometer import Sweep, read_sweep
 from fitting.rigs import torsion
 from fitting.rigs.torsion import Drive
 from liverjax.core.struct import replace
@@ -237,6 +238,32 @@ def test_inertia_is_taken_off_and_put_back():
     # No modulus of a passive material has such a small loss if inertia dominates.
     with pytest.raises(lj.InputError, match="the inertia of the sample is too large to compute the modulus"):
         sample_inertia.taken_off(Sweep(omega, 0 * omega + 1.0, 0 * omega - 50.0), 1060.0, 0.008)
+
+
+def test_the_inertia_of_a_sample_in_tension_is_that_of_young_s_modulus(tmp_path):
+    """The formula of torsion was used for E / 3. So G' of 10 kPa became 21 kPa."""
+    omega, young = 2 * np.pi * np.geomspace(1, 50, 12), 30e3 * (1 + 0.1j)
+    x = omega * 0.02 * np.sqrt(1060 / young)
+    seen = young * x / np.tan(x)
+    rows = np.column_stack([omega / (2 * np.pi), seen.real, seen.imag])
+    sweeps = {}
+    for name in ("E", "bending E"):
+        head = f"frequency_Hz,{name}' [Pa],{name}'' [Pa]"
+        np.savetxt(tmp_path / "e.csv", rows, "%.17g", ",", header=head, comments="")
+        sweeps[name] = read_sweep(tmp_path / "e.csv")
+    own = sample_inertia.taken_off(sweeps["E"], 1060.0, 0.02)
+    np.testing.assert_allclose(own.storage + 1j * own.loss, 10e3 * (1 + 0.1j) * np.ones(12), rtol=1e-9)
+    assert own.tensile and sweeps["E"].load == "tension"
+    back = sample_inertia.put_back(own, 1060.0, 0.02)
+    np.testing.assert_allclose(back.storage, seen.real / 3, rtol=1e-9)
+    # The simulation has the inertia of torsion, so it is run without inertia.
+    assert simulated_rheometer.Simulation(density=1060.0, tensile=True).run.density is None
+    for wrong, words in (
+        (lambda s: sample_inertia.taken_off(s, 1060.0, 0.02), "of bending, where .* remove --density"),
+        (lambda s: with_friction(s, 1e-7, 0.01, 0.02), "of bending, and --friction-error 1e-07 .* remove"),
+    ):
+        with pytest.raises(lj.InputError, match=words):
+            wrong(sweeps["bending E"])
 
 
 @pytest.mark.ci

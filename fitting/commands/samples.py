@@ -38,8 +38,8 @@ def run(options: argparse.Namespace) -> int:
             print(f"note: {path.name}: {note}", file=sys.stderr)
     usual = Simulation()
     rig = Simulation(radius=options.radius or usual.radius, height=options.height or usual.height)
-    for fit in found.fits:
-        fit.details["geometry_error"] = total_error.of_geometry(rig, None)
+    for fit, sweep in zip(found.fits, found.sweeps, strict=True):
+        fit.details["geometry_error"] = total_error.of_geometry(rig, None, sweep.tensile)
     content = samples_report.write(options.out, found)
     print(samples_report.table(found))
     if options.cards:

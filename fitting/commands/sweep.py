@@ -397,7 +397,7 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
     from fitting.readers import frequency_sweep
     from fitting.rigs import compression
 
-    simulation = _simulation(options)
+    simulation = _simulation(options)._replace(tensile=sweep.tensile)
     if simulation.inertia is not None:
         sweep, noted = sample_inertia.taken_off(sweep, *simulation.inertia), sweep.notes
         for note in sweep.notes[len(noted) :]:
@@ -419,7 +419,7 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
         fits.append(_simulated(options, corrected, fits[0], simulation.run))
         fits[1].details.update(heavy)
     for fit in fits:
-        fit.details["geometry_error"] = total_error.of_geometry(simulation, options.gap_error)
+        fit.details["geometry_error"] = total_error.of_geometry(simulation, options.gap_error, sweep.tensile)
     for fit in fits if options.precompression else ():  # `compression_numbers` uses `geometry_error`
         fit.details["precompression"] = compressed_sample.compression_numbers(fit, simulation)
     return fits, corrected
@@ -463,7 +463,7 @@ def _posterior(options: argparse.Namespace, sweep: "Sweep", fit: "Fit") -> "Post
     if not options.samples or not shared_options.has_draws(fit.kind):
         return None
     if fit.method == "torsion":
-        simulation = _simulation(options).run
+        simulation = _simulation(options)._replace(tensile=sweep.tensile).run
         inertia = simulation.inertia
         if inertia is not None:  # the simulated moduli contain the inertia
             G = sample_inertia.shown(fit.storage + 1j * fit.loss, sweep.angular_frequency, *inertia)

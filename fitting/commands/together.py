@@ -53,8 +53,11 @@ def errors_of_sizes(options: argparse.Namespace, tests: "list[Measured]") -> np.
     rig = Simulation(radius=options.radius or default.radius, height=options.height or default.height)
 
     def error_of(test: "Measured") -> float:
-        axial = isinstance(test, TimeTest) and test.axial
-        return 0.0 if isinstance(test, Dispersion) else total_error.of_geometry(rig, None, axial)
+        if isinstance(test, Dispersion):
+            return 0.0
+        if isinstance(test, TimeTest) and test.described:
+            return total_error.of_described_sizes(test.per_size)
+        return total_error.of_geometry(rig, None, test.axial if isinstance(test, TimeTest) else test.tensile)
 
     return np.array(list(map(error_of, tests)))
 

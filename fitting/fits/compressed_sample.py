@@ -12,6 +12,7 @@ from fitting.methods.generalised_maxwell import Maxwell, weighed
 from fitting.readers.frequency_sweep import Sweep
 from fitting.rigs import compression
 from liverjax import laws
+from liverjax.core.errors import InputError
 
 
 def of_compressed_sample(fit: Fit, sweep: Sweep, factors: compression.Shares) -> Fit:
@@ -24,7 +25,15 @@ def of_compressed_sample(fit: Fit, sweep: Sweep, factors: compression.Shares) ->
             factors.
         sweep: the measured moduli.
         factors: factors by which the compression changes the relaxing and the equilibrium moduli.
+
+    Raises:
+        InputError: the moduli are of tension or bending. The factors are only for torsion.
     """
+    if sweep.tensile:
+        raise InputError(
+            f"{sweep.source or 'sweep'}: the moduli are of {sweep.load}, but --precompression is for the torsion of a "
+            "compressed sample: remove --precompression"
+        )
     kind, details = _kind_at_rest(fit.kind, factors), fit.details
     if kind.moduli is not None:
         kind, details = _of_own_moduli(kind, fit, sweep)

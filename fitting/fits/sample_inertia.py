@@ -1,9 +1,12 @@
-"""Inertia of a cylinder in oscillating torsion, in closed form. This inertia changes the modulus that a rheometer
-measures.
+"""Inertia of a cylinder in oscillating torsion or tension, in closed form. This inertia changes the modulus that an
+instrument measures.
 
 Shear waves run along the axis of the sample, with the wave number k = omega sqrt(rho/G*) for the angular frequency
 omega and the density rho. A rheometer divides the torque at the turning plate by the angle of this plate. So it
 measures G* k h cot(k h) instead of G*, for the sample height h (Schrag 1977, Trans. Soc. Rheol. 21, 399).
+
+In tension, the same formula holds for Young's modulus 3 G* of a slender sample. Its wave number is omega sqrt(rho/3G*).
+So the formula for G* is that of torsion with a third of the density.
 """
 
 import numpy as np
@@ -60,15 +63,26 @@ def modulus_of(seen: np.ndarray, omega: np.ndarray, density: float, height: floa
     return np.where(good, G, np.nan)
 
 
+def _as_in_torsion(sweep: Sweep, density: float) -> float:
+    """Return the density with which the formulas of torsion give the inertia in the test of the sweep."""
+    if sweep.load == "bending":
+        raise InputError(
+            f"{sweep.source or 'sweep'}: the moduli are of bending, where the inertia of the sample is not known: "
+            "remove --density"
+        )
+    return density / 3 if sweep.tensile else density
+
+
 def taken_off(sweep: Sweep, density: float, height: float) -> Sweep:
     """Return the sweep with the true moduli of the sample. The measured moduli contain the effect of the inertia, which
     this function subtracts. A note gives the largest change.
 
     Raises:
-        InputError: at some frequency, no modulus can be computed, or G' or G'' without the inertia is not positive.
+        InputError: at some frequency, no modulus can be computed, or G' or G'' without the inertia is not positive;
+            or the moduli are of bending.
     """
     seen = sweep.storage + 1j * sweep.loss
-    G = modulus_of(seen, sweep.angular_frequency, density, height)
+    G = modulus_of(seen, sweep.angular_frequency, _as_in_torsion(sweep, density), height)
     hertz = sweep.angular_frequency / (2 * np.pi)
     lost = np.flatnonzero(~(np.isfinite(G) & (G.real > 0) & (G.imag > 0)))
     if lost.size:
@@ -88,7 +102,8 @@ def taken_off(sweep: Sweep, density: float, height: float) -> Sweep:
 
 
 def put_back(sweep: Sweep, density: float, height: float) -> Sweep:
-    """Return the sweep as a rheometer measures it, with the effect of the inertia. This is the inverse of `taken_off`,
-    but it adds no note."""
+    """Return the sweep as the instrument measures it, with the effect of the inertia. This is the inverse of
+    `taken_off`, but it adds no note."""
+    density = _as_in_torsion(sweep, density)
     seen = shown(sweep.storage + 1j * sweep.loss, sweep.angular_frequency, density, height)
     return sweep._replace(storage=seen.real, loss=seen.imag)

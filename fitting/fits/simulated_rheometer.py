@@ -58,6 +58,7 @@ class Simulation(NamedTuple):
     strain: float = 1e-3  # amplitude at the rim (section 5.2)
     density: float | None = None  # of the sample [kg/m^3]; None: the moduli contain no inertia
     precompression: float = 0.0  # compression by the plates, divided by the height at rest (`compression`)
+    tensile: bool = False  # whether the data are of tension (`Sweep.tensile`)
 
     @property
     def is_linear(self) -> bool:
@@ -76,8 +77,9 @@ class Simulation(NamedTuple):
     @property
     def run(self) -> "Simulation":
         """The settings of the simulation that is fitted to the data. For a compressed sample, the error of the mesh is
-        known only for a simulation without inertia. So the inertia is subtracted from the data instead."""
-        return self._replace(density=None) if self.precompression else self
+        known only for a simulation without inertia. So the inertia is subtracted from the data instead. The same is
+        done for data of tension, because their inertia is not that of torsion."""
+        return self._replace(density=None) if self.precompression or self.tensile else self
 
 
 #: Up to this strain at the rim, the derivatives are computed with the linear rig. The relative error of the derivatives

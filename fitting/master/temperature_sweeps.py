@@ -171,6 +171,7 @@ def joined(sweeps: Sequence[Sweep]) -> Sweep:
         sd_estimated=all(given) and all(s.sd_estimated for s in sweeps),
         sd_before=all(given) and all(s.sd_before for s in sweeps),
         sweep_numbers=np.repeat(np.arange(len(sweeps)), [len(s.storage) for s in sweeps])[order],
+        load=next((s.load for s in sweeps if s.tensile), "shear"),
     )
 
 

@@ -38,6 +38,7 @@ class Sweep(NamedTuple):
     sd_estimated: bool = False  # True: the sd come from the scatter of the points and are only weights
     sd_before: bool = False  # True: the sd belong to the moduli before a correction, and are only weights
     sweep_numbers: np.ndarray | None = None  # (n,) number of the sweep of each point, if several sweeps are joined
+    load: str = "shear"  # how the sample was loaded: shear, tension (or compression), bending; all moduli are of shear
 
     @property
     def deviations(self) -> tuple[np.ndarray, np.ndarray]:
@@ -59,6 +60,11 @@ class Sweep(NamedTuple):
             for own in each:
                 scales[-1][own] = smooth_deviations(omega[own], modulus[own], sd[own])
         return scales[0], scales[1]
+
+    @property
+    def tensile(self) -> bool:
+        """Whether E' and E'' were measured, in tension or bending. `storage` and `loss` are then a third of them."""
+        return self.load != "shear"
 
     @property
     def as_measured(self) -> "Sweep":
@@ -317,7 +323,16 @@ def without_copies(sweep: Sweep) -> Sweep:
 
 def with_friction(sweep: Sweep, error: float, radius: float, height: float) -> Sweep:
     """Return the sweep with its fields `friction` and `friction_error`. `error` [N m s] is the standard deviation of
-    the friction of the instrument's bearing; `radius` and `height` of the sample are in m."""
+    the friction of the instrument's bearing; `radius` and `height` of the sample are in m.
+
+    Raises:
+        InputError: the moduli are of tension or bending.
+    """
+    if sweep.tensile:
+        raise InputError(
+            f"{sweep.source or 'sweep'}: the moduli are of {sweep.load}, and --friction-error {error:g} is the "
+            "friction of an instrument that turns the sample: remove --friction-error"
+        )
     geometry = np.pi * radius**4 / (2 * height)
     return sweep._replace(friction=error * sweep.angular_frequency / geometry, friction_error=error)
 

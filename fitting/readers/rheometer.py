@@ -17,7 +17,7 @@ from fitting.readers.frequency_sweep import FEWEST, Sweep, mostly_repeated, with
 from fitting.readers.frequency_sweep import some as some
 from fitting.readers.frequency_sweep import within as within
 from fitting.readers.frequency_sweep import without_inertia as without_inertia
-from fitting.readers.tables.complex_moduli import column_in_si, fault_of, storage_and_loss, to_shear
+from fitting.readers.tables.complex_moduli import column_in_si, fault_of, load_of, storage_and_loss, to_shear
 from fitting.readers.tables.sweep_columns import MODULI, Column, is_tensile
 from fitting.readers.tables.sweep_headings import known_unit
 from fitting.readers.tables.sweep_tables import Table, choose_table, tables_of
@@ -151,7 +151,8 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
         if column.quantity not in first:
             columns[j] = column_in_si(path, column, written[:, j], notes)
             first[column.quantity] = column, columns[j]
-    notes += (stretched := to_shear(first))
+    load = load_of(first)
+    notes += to_shear(first)
     if poor := _poor_deviations(table, columns):
         notes += poor
         first = {q: own for q, own in first.items() if not q.endswith("_sd")}
@@ -173,7 +174,7 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
         )
     values = storage_and_loss(values, notes)
     beside = [(c, written[good]) for c, written in table.beside]
-    notes += _contradictions(path, beside, values | {"frequency": omega}, bool(stretched))
+    notes += _contradictions(path, beside, values | {"frequency": omega}, load != "shear")
     if ("storage_sd" in values) != ("loss_sd" in values):
         raise InputError(
             f"{path}: only one of storage_modulus_sd_Pa and loss_modulus_sd_Pa is in the file; give both or none"
@@ -183,7 +184,7 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
         notes.append(SORTED)
     get: Content = {q: values[q][order] if q in values else None for q in ("storage", "loss", "storage_sd", "loss_sd")}
     raw = {q: v[good][order] for q, v in table.raw.items()}
-    found = without_copies(Sweep(omega[order], **get, source=path, notes=tuple(notes), raw=raw or None))
+    found = without_copies(Sweep(omega[order], **get, source=path, notes=tuple(notes), raw=raw or None, load=load))
     repeated = len(found.storage) - len(np.unique(omega))
     if repeated:
         found = found._replace(notes=(*found.notes, f"repeated frequencies: {repeated}. {REPEATED}"))

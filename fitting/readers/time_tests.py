@@ -16,7 +16,7 @@ from fitting.readers.noise_of_series import (
     smooth_sizes,
     told_of_far_values,
 )
-from fitting.readers.tables.time_columns import FORMS, beyond_small, read_columns
+from fitting.readers.tables.time_columns import FORMS, TENSILE, beyond_small, in_shear, named_columns, read_columns
 from liverjax.core.errors import InputError
 
 #: A load below this fraction of the largest load counts as rest: its effect on the response is just as small.
@@ -51,7 +51,10 @@ class TimeTest(NamedTuple):
     # Standard deviation of the rounding errors of the responses, 0 if they are not rounded. It is found before the base
     # line is subtracted, because rows with the same response differ after a drift is subtracted.
     rounding: float = 0.0
-    axial: bool = False  # whether the file has columns of displacement and force
+    axial: bool = False  # whether force and displacement were measured, or moduli of tension, instead of torque
+    # Relative change of all moduli per metre of the height or thickness, and per metre of the radius, if a TOML file
+    # describes the test.
+    per_size: tuple[float, float] = (0.0, 0.0)
 
     @property
     def scales(self) -> np.ndarray:
@@ -147,7 +150,9 @@ def read_time_test(
             f"--min-time {start:g} must be a finite number of seconds, 0 or more, on the time axis of the file: give "
             "e.g. 0.5"
         )
-    columns, notes = read_columns(path)
+    named, notes = named_columns(path)
+    axial = not TENSILE.keys().isdisjoint(named)
+    columns, notes = in_shear(named, notes)
     time = columns["time"]
     form = next((f for f in FORMS if set(f) <= set(columns)), None)
     if form is None or (form[0] in ("modulus", "compliance") and form[0] != _own_table(kind)):
@@ -180,9 +185,9 @@ def read_time_test(
         driven, scatter = without_scatter(time, driven, "strain" if kind == "relaxation" else "stress")
         test = of_columns(kind, time, driven, answer, (str(path), [*notes, *told, *scatter]), start)
         test = with_known_rise(test, own_time, own_drive, ramp)
-        return test._replace(axial=form == ("displacement", "force"))
+        return test._replace(axial=axial or form == ("displacement", "force"))
     test = TimeTest(kind, time, driven, answer, time > 0, str(path), tuple(notes))
-    return _checked(test._replace(rise=GIVEN), start)
+    return _checked(test._replace(rise=GIVEN, axial=axial), start)
 
 
 def of_columns(

@@ -40,6 +40,11 @@ class Prediction(NamedTuple):
         return np.abs(self.predicted - self.measured) / self.sizes
 
     @property
+    def counted(self) -> np.ndarray:
+        """Whether the point is in the band and has not decayed into the noise (m,)."""
+        return self.inside & np.isfinite(self.sizes)
+
+    @property
     def factor(self) -> float:
         """Factor by which the prediction must be multiplied to fit the test best. With another sample or another
         strain, all values often differ by one factor."""
@@ -48,13 +53,13 @@ class Prediction(NamedTuple):
 
     @property
     def covered(self) -> float:
-        """Fraction of the measured values in the band that lie within the 95 % interval of the prediction. The half
-        width of this interval is the root of the sum of two squares: the half width from the fit (`quantile`), and the
-        half width from the scatter of the measured values. NaN if this scatter is unknown."""
-        if np.isnan(self.noise).any():
+        """Fraction of the `counted` values that lie within the 95 % interval of the prediction. The half width of this
+        interval is the root of the sum of two squares: the half width from the fit (`quantile`), and the half width
+        from the scatter of the measured values. NaN if this scatter is unknown, or if no value counts."""
+        if np.isnan(self.noise).any() or not self.counted.any():
             return np.nan
-        off, own = (v[self.inside] for v in (self.predicted - self.measured, self.noise * self.scales))
-        of_fit = self.quantile * self.standard_errors[self.inside]
+        off, own = (v[self.counted] for v in (self.predicted - self.measured, self.noise * self.scales))
+        of_fit = self.quantile * self.standard_errors[self.counted]
         return float(np.mean(np.abs(off) < np.hypot(of_fit, scipy.stats.norm.ppf(0.975) * own)))
 
 
@@ -118,14 +123,14 @@ def sentence(found: Prediction) -> str:
     """Return one line about a prediction for the user."""
     share, inside = len(found.measured), int(found.inside.sum())
     name = f"{found.name} {found.source}"
-    counted = found.inside & np.isfinite(found.sizes)
+    counted = found.counted
     if not counted.any():
         where = "in the band have decayed into the noise" if inside else "lie outside the band of the sweep"
         return f"{name}: predicted, but all {inside or share} values {where}"
     off = 100 * found.relative_errors[counted].mean()
     told = f"{name}: predicted within {off:.2g} % on average"
     if not np.isnan(found.covered):
-        told += f"; {100 * found.covered:.0f} % of {inside} numbers lie in the 95 % interval of the prediction"
+        told += f"; {100 * found.covered:.0f} % of {counted.sum()} numbers lie in the 95 % interval of the prediction"
     with_factor = found._replace(predicted=found.factor * found.predicted)
     if abs(found.factor - 1) > _ONE and 100 * with_factor.relative_errors[counted].mean() <= 0.5 * off:
         told += f"; {found.factor:.3g} times the prediction would fit the test best"

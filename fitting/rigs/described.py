@@ -64,6 +64,8 @@ _WIDE, _WIDEST = 0.05, 500
 _FEWEST = 6
 #: Maximum number of rows of an indenter's test, including the rows that are added between the measured rows.
 _MOST_ROWS = 2000
+#: Relative change of a size of the sample, for derivatives with respect to this size.
+_STEP = 0.01
 #: Glued samples are simulated up to this ratio of height to radius. Above this ratio, meshes are large and a run takes
 #: minutes.
 _SLENDER = 10.0
@@ -133,7 +135,8 @@ def read_described(path: str | Path) -> TimeTest:
     driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
     notes = [*notes, *told, *told_of_start, *told_of_rows]
     test = of_columns(kind, time, driven, answer, (str(path), notes), described.min_time)
-    return with_known_rise(test, own_time, own_drive, ramp)._replace(described=True)
+    per_size = _change_per_size(described, largest)
+    return with_known_rise(test, own_time, own_drive, ramp)._replace(described=True, per_size=per_size)
 
 
 def _rows_to_fit(
@@ -284,6 +287,34 @@ def _elastic(described: Described, largest: float, path: str) -> tuple[Callable[
     if described.test != "punch":
         said += ", and to grow until the largest displacement"
     return (lambda d: per_shear * float(layer.force(np.array([d]))[0])), sizes["thickness"], [said]
+
+
+def _change_per_size(described: Described, largest: float) -> tuple[float, float]:
+    """Return the relative change of the moduli per metre of the height or thickness, and per metre of the radius. For a
+    glued punch, this is the radius of the punch. The half angle of a cone is assumed to be exact.
+
+    These numbers are only for errors, so approximations are enough for glued samples. The stiffness of a glued cylinder
+    is that of Gent and Lindley (1959, Proc. Inst. Mech. Eng. 173:111). A glued punch is a punch on a wide layer.
+    """
+    sizes, test = described.sizes, described.test
+    height, radius = sizes.get("thickness", sizes.get("height", 0.0)), sizes.get("punch", sizes.get("radius", 0.0))
+
+    def force(height: float, radius: float) -> float:
+        if test in ("tension", "compression"):
+            return radius**2 / height * (1 + (radius / height) ** 2 / 2)
+        shape = "punch" if test == "glued_punch" else test
+        angle = sizes.get("half_angle", 45.0)
+        layer = thin_layer.Layer(thin_layer.Indenter(shape, height, described.poisson, radius, angle))
+        return float(layer.force(np.array([largest]))[0])
+
+    # A thicker layer and a smaller indenter stay within the table of forces.
+    own, thicker, smaller = (
+        force(height, radius),
+        force((1 + _STEP) * height, radius),
+        force(height, (1 - _STEP) * radius),
+    )
+    by_radius = (1 - smaller / own) / (_STEP * radius) if radius else 0.0
+    return (1 - thicker / own) / (_STEP * height), by_radius
 
 
 def _glued_curve(described: Described, largest: float, path: str) -> tuple[Callable[[float], float], float, list[str]]:

@@ -9,6 +9,7 @@ Sources: Lebedev and Ufliand 1958, J. Appl. Math. Mech. 22:442; Hayes et al. 197
 Dimitriadis et al. 2002, Biophys. J. 82:2798 (the series).
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -65,6 +66,7 @@ def _contact(width: float, poisson: float, shape: str) -> tuple[float, float]:
     return float(depth / profile[-1]), float(w @ (depth * level - dented) / alone)
 
 
+@lru_cache(maxsize=8)  # the table does not depend on the sizes of indenter and layer
 def factors(poisson: float, shape: str) -> Factors:
     """Compute the table of force factors for a sphere or a cone, for contact radii from 0 to 8 times the thickness.
 

@@ -197,7 +197,7 @@ def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> Tim
     fits = [f for f in tried if able(f, test)] or tried
     best = _preferred_of(fits, time_tests.criterion)
     rows = _compared_models(tried, time_tests.criterion, test)
-    rows = _with_other_kind(rows, prony) if model == "auto" else rows
+    rows = _with_other_kind(rows, prony, prony.details["tried"]) if model == "auto" else rows
     sentences = best.warnings if best is prony else (*best.warnings, *_cautions_in_time(best))
     seconds = {n: sum(getattr(f, n) for f in {id(f): f for f in (*tried, prony)}.values()) for n in TIMES}
     whole = with_own_noise(best._replace(warnings=sentences, details=best.details | {"tried": rows}, **seconds))
@@ -236,10 +236,10 @@ def _compared_models(tried: Sequence, criterion: Callable, data: uncertainty.Ban
     return sorted(rows, key=lambda row: row["above_the_lowest"])
 
 
-def _with_other_kind(rows: list[Content], prony: TimeFit) -> list[Content]:
+def _with_other_kind(rows: list[Content], prony: AFit, tried: list[Content]) -> list[Content]:
     """Return the table of compared models with one more row: the best fluid if `prony` is a solid, or the best solid if
-    `prony` is a fluid. No row is added if no such fit was tried, or if the test determines no such fit."""
-    tried: list[Content] = prony.details["tried"]
+    `prony` is a fluid. No row is added if no such fit was tried, or if the test determines no such fit. `tried`: the
+    table of all fits from which `prony` was chosen."""
     others = [row for row in tried if row["model"] != prony.kind.name and row["identifiable"]]
     if not others:
         return rows
@@ -342,6 +342,7 @@ def _best_of_models(tests: list[Measured], model: str, prony: Together, progress
     fits = [f for f in tried if able(f, band)] or tried
     best = _preferred_of(fits, residuals_of_tests.criterion_of_all)
     rows = _compared_models(tried, residuals_of_tests.criterion_of_all, band)
+    rows = _with_other_kind(rows, prony, prony.tried) if model == "auto" else rows
     seconds = {n: sum(getattr(f, n) for f in {id(f): f for f in (*tried, prony)}.values()) for n in TIMES}
     if best is prony:
         return best._replace(tried=rows, **seconds)

@@ -28,10 +28,15 @@ def of_geometry(simulation: Simulation, gap_error: float | None, axial: bool = F
     Args:
         simulation: the radius and the gap.
         gap_error: standard deviation [m] of the gap; None: `GAP`.
-        axial: whether force and displacement were measured, instead of torque and twist.
+        axial: whether force and displacement were measured, or moduli of tension, instead of torque and twist.
     """
     gap, power = GAP if gap_error is None else gap_error, 2 if axial else 4
     return float(np.hypot(gap / simulation.height, power * RADIUS / simulation.radius))
+
+
+def of_described_sizes(per_size: tuple[float, float]) -> float:
+    """Return the same error for a test that a TOML file describes. `per_size`: see `TimeTest`."""
+    return float(np.hypot(GAP * per_size[0], RADIUS * per_size[1]))
 
 
 def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:

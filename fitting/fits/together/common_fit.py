@@ -12,6 +12,7 @@ from functools import partial
 import numpy as np
 
 from fitting.fits import viscoelastic
+from fitting.fits.families import choice
 from fitting.fits.together.contributions import shares_of
 from fitting.fits.together.doubts import (
     disagreements,
@@ -52,8 +53,8 @@ ROUNDS, SETTLED = 12, 0.01
 def fit(
     tests: Sequence[Measured], modes: int | str = "auto", progress: Callable[[str], None] = lambda text: None
 ) -> Together:
-    """Choose the number of modes by the lowest information criterion. A fit can be chosen only if the tests together
-    determine all its modes.
+    """Choose the number of modes, and a solid or a fluid, by the information criterion (`choice.preferred`). A fit can
+    be chosen only if the tests together determine all its modes.
 
     Args:
         tests: two or more tests.
@@ -80,7 +81,7 @@ def fit(
             tests, band, range(max(numbers.start, solid.modes - 1), numbers.stop), FLUID, progress
         )
     able = [f for f in tried if _able(f, band)] or tried
-    chosen = min(able, key=criterion_of_all)
+    chosen = able[choice.preferred([choice.label_of(f) for f in able], list(map(criterion_of_all, able)))]
     progress("what each test adds")
     return _told_of_all(chosen, tried, band)
 

@@ -2,7 +2,15 @@
 
 import numpy as np
 
-from fitting.readers.tables.sweep_columns import MODULI, Column, is_angular, is_tensile, names_shear, pair_of
+from fitting.readers.tables.sweep_columns import (
+    MODULI,
+    Column,
+    is_angular,
+    is_bent,
+    is_tensile,
+    names_shear,
+    pair_of,
+)
 from fitting.readers.tables.sweep_headings import UNITS, known_unit
 from fitting.readers.units import FREQUENCY_UNITS, MODULUS_UNITS, PER_SECOND
 from liverjax.core.errors import InputError
@@ -76,6 +84,14 @@ def fault_of(column: Column, written: float, value: float, smallest: float, larg
     else:
         return None
     return f"{column.name} = {written:g} {problem}", remedy
+
+
+def load_of(columns: dict[str, tuple[Column, np.ndarray]]) -> str:
+    """Return how the sample was loaded, from the headings of the moduli: shear, tension or bending."""
+    moduli = [column for q, (column, _) in columns.items() if q.split("_")[0] in MODULI]
+    if any(map(is_bent, moduli)):
+        return "bending"
+    return "tension" if any(map(is_tensile, moduli)) else "shear"
 
 
 def to_shear(columns: dict[str, tuple[Column, np.ndarray]]) -> list[str]:

@@ -110,6 +110,11 @@ def is_tensile(column: Column) -> bool:
     return bool(re.match(r"\s*e[_ ]|\s*epp?\b|\s*[(|]?e\b", name) or re.search(words, name))
 
 
+def is_bent(column: Column) -> bool:
+    """Return whether the heading names a modulus of bending."""
+    return re.search(r"\b(flexural|bending|biege)", column.name.lower()) is not None
+
+
 def names_shear(column: Column) -> bool:
     """Return whether the heading names a modulus of shear, G."""
     return re.search(r"shear|(^|[^a-z])g([^a-z]|$)", column.name.lower()) is not None

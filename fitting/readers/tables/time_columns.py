@@ -141,6 +141,13 @@ def read_columns(
     Raises:
         InputError: the file cannot be used; the message names the column or line, the value and the remedy.
     """
+    return in_shear(*named_columns(path, preferred))
+
+
+def named_columns(
+    path: str | os.PathLike, preferred: tuple[str, ...] = FORMS[0]
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Return the same columns and notes as `read_columns`, but with the tensile quantities not converted to shear."""
     columns, notes = _columns_in_time(
         str(path), text_of(Path(path), "a relaxation or creep test").splitlines(), preferred
     )
@@ -175,7 +182,7 @@ def _columns_in_time(
         if "time" in found and form is not None:
             found = {q: found[q] for q in ("time", *form)}  # other columns may have empty cells and other units
             rows, units, left_out = _rows_in_time(path, lines, k + 1, delimiter, found)
-            columns, notes = _of_shear(*_in_si(path, found, np.array(rows), units))
+            columns, notes = _in_si(path, found, np.array(rows), units)
             return columns, [*_told_of_times(cells), *notes, *left_out, *_told_of_tables(lines[k + 1 :])]
     unknown = next(filter(None, map(_unknown_unit, lines)), None)
     if unknown is not None:
@@ -188,7 +195,7 @@ def _columns_in_time(
     )
 
 
-def _of_shear(columns: dict[str, np.ndarray], notes: list[str]) -> tuple[dict[str, np.ndarray], list[str]]:
+def in_shear(columns: dict[str, np.ndarray], notes: list[str]) -> tuple[dict[str, np.ndarray], list[str]]:
     """Return the columns with tensile quantities converted to shear, and a note on this."""
     tensile = [name for name in TENSILE if name in columns]
     for name in tensile:
