@@ -252,6 +252,52 @@ def test_a_frequency_beyond_the_series_is_told():
     assert law_fit.outside_series(law_fit.Memory(), 2 * np.pi * 20) is None
 
 
+def test_copied_points_are_no_new_measurements(tmp_path, tanned):
+    """If every line was written twice, the standard errors of c1 and c2 were too small, and a warning said that
+    neighbouring points are correlated."""
+    law, memories, shares = tanned
+    path = written(tmp_path / "sweep.csv", law, memories, 0.02, shares)
+    head, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([head, *(row for row in rows for _ in range(2))]))
+    sweep = strain_sweep.read_strain_sweep(path)
+    assert len(sweep.strain) == len(STRAIN)
+    assert "12 of 24 points are ignored, because they are copies of other points" in sweep.notes
+
+
+@pytest.mark.parametrize("name", ["Strain / %", "Strain in %", '"Strain, %"', "Shear strain [%]"])
+def test_a_strain_column_may_state_its_unit_in_several_ways(tmp_path, tanned, name):
+    path = written(tmp_path / "sweep.csv", *tanned[:2], 0.0, tanned[2])
+    path.write_text(path.read_text().replace("strain_%", name))
+    np.testing.assert_allclose(strain_sweep.read_strain_sweep(path).strain, STRAIN, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["Shear strain [-]", "Strain / mm/mm", "Strain (mm/mm)", "strain_1"])
+def test_a_strain_may_be_a_fraction(tmp_path, tanned, name):
+    path = written(tmp_path / "sweep.csv", *tanned[:2], 0.0, tanned[2], 1e-4 * STRAIN)
+    path.write_text(path.read_text().replace("strain_%", name))
+    sweep = strain_sweep.read_strain_sweep(path)
+    np.testing.assert_allclose(sweep.strain, 0.01 * STRAIN, rtol=1e-12)
+    assert not sweep.notes
+
+
+def test_a_wrong_phase_and_one_wrong_point_are_no_fault_of_the_law():
+    """If the phase of the series was wrong, the errors were those of magnitude and phase, and the advice was another
+    law. One wrong point at the end gave the advice to ignore the large strains."""
+    ones = np.ones(len(STRAIN))
+    sweep = strain_sweep.StrainSweep(STRAIN, 1000 * ones, 100 * ones, 2 * np.pi)
+    memory = law_fit.Memory(Maxwell(1.0, np.array([0.3]), np.array([0.5 / np.pi])))  # a loss tangent of 3 / 17
+    (candidate,) = stress_stretch.candidates("neo_hookean")
+    found = law_fit.fit_law(candidate, sweep, memory, "parallel")
+    off = [np.sqrt(np.mean(v**2)) for v in (found.storage / 1000 - 1, found.loss / 100 - 1)]
+    np.testing.assert_allclose([found.law.curve_errors[name] for name in ("G'", "G''")], off, rtol=1e-9)
+    assert off[0] < 0.02 and off[1] > 0.7
+    told = " ".join(law_fit.said_of(sweep, [found]))
+    assert "follows from the series of --model" in told and "try another law" not in told
+    wrong = np.where(STRAIN[0] == STRAIN, 1.35, 1.0)
+    told = " ".join(law_fit.said_of(sweep._replace(loss=3000 / 17 * wrong), [found]))
+    assert "the loss tangent changes" not in told
+
+
 def test_laws_that_follow_a_sweep_as_well_are_named(tmp_path, tanned):
     law, memories, shares = tanned
     sweep = strain_sweep.read_strain_sweep(written(tmp_path / "a.csv", law, memories, 0.0, shares))

@@ -112,6 +112,16 @@ def test_unloading_preload_and_decimal_commas_are_seen(tmp_path, capsys):
     assert "subtract the preload" in capsys.readouterr().err
 
 
+def test_the_stress_of_a_stretched_sample_without_shear_is_no_preload():
+    """A sample was stretched by 20 % and then sheared. Its tensile stress without shear was taken for a preload."""
+    shear = np.linspace(0.0, 0.5, 11)
+    for stretch, told in ((1.2, 0), (1.0, 1)):
+        F = np.tile(np.diag([stretch, stretch**-0.5, stretch**-0.5]), (11, 1, 1))
+        F[:, 0, 1] = shear
+        words = stress_stretch.loaded_at_rest([curves.Curve("a", "simple_shear", F, (0, 0), 506 + 1000 * shear**2)])
+        assert len(words) == told and all("where the sample is not deformed" in own for own in words)
+
+
 MEANINGS = {
     "none": (lambda a, P: (a, P), ""),
     "true stress": (lambda a, P: (a, P * a), "if the stress were true stress"),

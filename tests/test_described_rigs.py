@@ -13,7 +13,7 @@ from fitting.commands.together import errors_of_sizes
 from fitting.fits import time_tests as fits
 from fitting.methods.generalised_maxwell import Maxwell, moduli
 from fitting.readers.time_tests import Sample, TimeTest, read_time_test
-from fitting.rigs import glued, thin_layer
+from fitting.rigs import described, glued, thin_layer
 from fitting.rigs.described import curve_of, read_described
 
 pytestmark = pytest.mark.quick_to_compile
@@ -208,9 +208,47 @@ def test_a_compression_by_a_fifth_is_computed(tmp_path):
     assert 1.02 < secants[1] / secants[0] < 1.2  # a glued disc stiffens in compression
 
 
-def test_the_elastic_curve_before_contact_is_straight():
+def test_the_elastic_curve_is_followed_on_both_sides_of_rest():
     values = curve_of(lambda d: 2 * d + d**2, np.array([-0.1, 0.0, 0.5, 1.0]))
-    np.testing.assert_allclose(values, [-0.2, 0.0, 1.25, 3.0], atol=1e-3)
+    np.testing.assert_allclose(values, [-0.19, 0.0, 1.25, 3.0], atol=1e-3)
+
+
+@pytest.mark.parametrize("poisson", [0.4995, 0.4])
+def test_a_slender_sample_is_stretched_uniformly_on_both_sides_of_rest(tmp_path, poisson):
+    """Such a sample was refused. The tensile stress in its place gave 0.84 of the modulus at a strain of 20 %. The half
+    of a cycle against the load was linear."""
+    r, h = 0.002, 0.05
+    time = np.arange(1, 41) / 4
+    d = 0.2 * h * np.sin(np.pi * time / 5)
+    stretch = 1 + d / h
+    force = 1000 * np.pi * r**2 * (stretch - stretch**-2)
+    file = written(tmp_path, {"test": "tension", "radius": r, "height": h, "poisson": poisson}, (time, d, force))
+    test = read_described(file)
+    assert any("25 radii, so its stretch is taken as uniform" in note for note in test.notes)
+    far = np.abs(d) > 0.05 * h
+    ratio = np.interp(time, test.time, test.answer)[far] / np.interp(time, test.time, test.driven)[far]
+    # The glued ends make the sample stiffer by 1.3 %. A compressible sample is softer by (1 + poisson) / 1.5.
+    np.testing.assert_allclose(ratio, 1000 * 1.5 / (1 + poisson), rtol=0.02 if poisson > 0.49 else 0.04)
+
+
+@pytest.mark.parametrize("test", ["tension", "compression"])
+def test_a_glued_sample_is_also_simulated_against_the_load(tmp_path, monkeypatch, test):
+    """The half of a cycle against the load was linear, with forces that were wrong by up to 18 %. A closed form of the
+    force takes the place of the simulation."""
+
+    def force(strains):
+        return 1e3 * (1 + strains - (1 + strains) ** -2)
+
+    monkeypatch.setattr(described.glued, "tension", lambda radius, height, dt, strains, cells: strains)
+    monkeypatch.setattr(described.glued, "read", lambda strains, law, prony: (force(strains), 0 * strains))
+    monkeypatch.setattr(described.glued, "mesh_error", lambda strains, law, prony: 0 * strains)
+    time = np.arange(1, 41) / 4
+    d = 0.0015 * np.sin(np.pi * time / 5) * (1 - 1e-6 * time)  # the load is the first half of the cycle
+    found = read_described(written(tmp_path, {"test": test, "radius": 0.01, "height": 0.01}, (time, d, 100 * d)))
+    assert any("against the direction of the load: the stiffness" in note for note in found.notes)
+    exact = force(d / 0.01 if test == "tension" else -d / 0.01)
+    strain = np.interp(time, found.time, found.driven)
+    np.testing.assert_allclose(strain / strain[9], exact / exact[9], atol=5e-3)
 
 
 def test_cycles_between_plates_give_the_numbers_back(tmp_path):
@@ -270,10 +308,9 @@ def test_the_commands_take_a_description(tmp_path):
         ({"radius": "wide"}, "radius = 'wide' is not a number"),
         ({"radius": 10.0}, "radius = 10 cannot be the size of a sample"),
         (
-            {"radius": 0.001, "height": 0.02},
-            "height = 0.02 m is 20 radii, but glued samples are computed only up to 10",
+            {"test": "glued_punch", "punch": 5e-4, "radius": 0.001, "height": 0.02},
+            "height = 0.02 m is 20 radii, but samples under a punch are computed only up to 10",
         ),
-        ({"radius": 0.001, "height": 0.02, "poisson": 0.4}, r"tensile stress divided by 2 \(1 \+ poisson\) = 2.8"),
         ({"radus": 0.01}, "did you mean radius"),
         ({"poisson": 0.5}, "must be from 0 to 0.4995"),
         ({"drive": "torque"}, "use displacement or force"),

@@ -63,6 +63,9 @@ WRONG = {
     "a compressed rig cannot be converted": lambda: torsion.scene_of(PRESSED, LAW, None, 1.0, 1e-6),
     "the factor of a compressed rig": lambda: torsion.geometry_factor(PRESSED, LAW),
     "-0.05 is out of range": lambda: compression.compressed(RIG, LAW, -0.05),
+    "free_height = True and a compression by 0.1 exclude": lambda: compression.compressed(
+        replace(RIG, free_height=True), LAW, 0.1
+    ),
     "plates = 'Cone' is not known": lambda: cycle.reading(np.array([0.1]), np.ones((1, 17)), "Cone"),
     "shape = 'Sphere' is not known": lambda: hertz.half_space(hertz.Indenter("Sphere", 1.0, 0.5, 1.0), np.ones(1)),
     "over 8 times the thickness": lambda: thin_layer.punch_factor(50.0, 1.0, 0.3),

@@ -7,7 +7,8 @@ import numpy as np
 
 from fitting.readers.tables.complex_moduli import column_in_si, storage_and_loss, to_shear
 from fitting.readers.tables.sweep_tables import choose_table, tables_of
-from fitting.readers.tables.text_tables import text_of
+from fitting.readers.tables.text_tables import text_of, without_multiples
+from fitting.readers.units import RAW_TORQUE_UNITS
 from liverjax.core.errors import InputError
 
 FEWEST_POINTS, LARGEST_STRAIN, LARGEST_WITHOUT_UNIT = 4, 10.0, 2.0
@@ -59,10 +60,9 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
     omega, both = values["frequency"], storage_and_loss(values, notes)
     G = both["storage"], both["loss"]
     strain = chosen.raw["strain"]
-    good = np.all([np.isfinite(column) & (column > 0) for column in (strain, omega, *G)], axis=0)
+    positive = np.all([np.isfinite(column) & (column > 0) for column in (strain, omega, *G)], axis=0)
+    good = _without_copied_rows(positive, [omega, *G, *chosen.raw.values()], notes)
     kept = good & (strain <= (np.inf if max_strain is None else max_strain))
-    if not good.all():
-        notes.append(f"{(~good).sum()} points without a positive strain, frequency or modulus are ignored")
     if good.sum() > kept.sum():
         notes.append(f"{good.sum() - kept.sum()} points above a strain of {max_strain:g} are ignored as requested")
     if len(np.unique(strain[kept])) < FEWEST_POINTS:
@@ -91,6 +91,26 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
     )
 
 
+def _without_copied_rows(positive: np.ndarray, columns: list[np.ndarray], notes: list[str]) -> np.ndarray:
+    """Return `positive` (n,) without copies of rows (`without_multiples`), and add notes on the ignored rows.
+
+    Args:
+        positive: whether the strain, the frequency and the moduli of a row are positive.
+        columns: all columns (n,) of the table.
+        notes: notes, to which this function adds its own.
+    """
+    if not positive.all():
+        notes.append(f"{(~positive).sum()} points without a positive strain, frequency or modulus are ignored")
+    places = np.flatnonzero(positive)
+    rows = np.nan_to_num(np.column_stack(columns)[places], nan=np.inf)  # an empty cell equals an empty cell
+    own = places[without_multiples([tuple(row) for row in rows.tolist()])] if len(places) else places
+    if len(own) < len(places):
+        notes.append(
+            f"{len(places) - len(own)} of {len(places)} points are ignored, because they are copies of other points"
+        )
+    return np.isin(np.arange(len(positive)), own)
+
+
 def _refuse_several_temperatures(path: Path, temperature: np.ndarray | None, kept: np.ndarray) -> None:
     if temperature is None:
         return
@@ -113,7 +133,7 @@ def _of_unit(path: Path, unit: str, largest: float) -> list[str]:
         )
     if not unit:
         return ["the strain column states no unit, so the unit 1 is assumed, not %"]
-    if unit != "1" and largest <= SMALLEST_LARGEST:
+    if RAW_TORQUE_UNITS["strain"][unit] != 1.0 and largest <= SMALLEST_LARGEST:
         return [
             f"the strains end at {100 * largest:.3g} %: if the numbers of the column are fractions, name the column "
             "strain_1"

@@ -91,7 +91,8 @@ def _known_headings(cells: list[str], units: list[str]) -> Iterator[tuple[int, s
         if rank is None:
             continue
         word, quantity = HEADINGS[rank]
-        rest = re.sub(r"^[\s_\[(]+|[\s\])]+$", "", name[len(word) :])
+        # Remove the sign or word before the unit, as in "Strain / %", "Strain, %" or "Strain in %".
+        rest = re.sub(r"^[\s_]*(?:[/,]|in\b)?[\s_\[(]*|[\s\])]+$", "", name[len(word) :])
         yield k, quantity, rank, _plain_unit(rest or (units[k] if k < len(units) else ""))
 
 

@@ -27,7 +27,7 @@ RAW_TORQUE_UNITS = {
     "sample_torque": _TORQUE,
     "angle": ANGLE_UNITS | {"urad": 1e-6},
     "phase": ANGLE_UNITS,
-    "strain": {"%": 0.01, "percent": 0.01, "1": 1.0, "": 1.0},
+    "strain": {"%": 0.01, "percent": 0.01, "1": 1.0, "-": 1.0, "mm/mm": 1.0, "": 1.0},
 }
 _PER_PA = {f"1/{unit}": 1 / factor for unit, factor in MODULUS_UNITS.items()} | {"Pa-1": 1.0, "Pa^-1": 1.0}
 #: Units of relaxation and creep tests; the first unit of each quantity is the default.

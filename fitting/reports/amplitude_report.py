@@ -25,7 +25,8 @@ def write(out: Path, sweep: StrainSweep, fits: list[StrainFit], warnings: Sequen
     the best fit. `warnings` are written before the warnings of the fits.
     """
     content = {
-        "error_is": "root mean square of the relative misfit of G' and G''",
+        "error_is": "mean_relative_error: root mean square of the misfits of G' and G'', both divided by |G*|. "
+        "curve_errors: root mean square of the misfit of each modulus, divided by this modulus",
         "data": sweep.source,
         "notes": list(sweep.notes),
         "frequency_Hz": sweep.angular_frequency / (2 * np.pi),

@@ -92,10 +92,12 @@ def incompressible(law: Law, strain: float) -> Shares | None:
 
 
 def side_stretch(law: Law, strain: float) -> float:
-    """Return the radial stretch of a cylinder that is compressed by `strain` between frictionless plates."""
+    """Return the radial stretch of a cylinder that is compressed by `strain` between frictionless plates. A negative
+    strain is a tension."""
     _refuse_directions(law)
     axial = 1 - strain
-    return float(brentq(lambda a: _cauchy(law, a, axial)[0], 0.9, 1.1 / np.sqrt(axial), xtol=1e-14))
+    ends = 0.9 * min(1.0, axial**-0.5), 1.1 * max(1.0, axial**-0.5)
+    return float(brentq(lambda a: _cauchy(law, a, axial)[0], *ends, xtol=1e-14))
 
 
 def torsional_density(law: Law, strain: float, density: float) -> float:
@@ -109,8 +111,8 @@ def torsional_density(law: Law, strain: float, density: float) -> float:
 
 
 def smooth_force(law: Law, strain: float, radius: float) -> float:
-    """Return the force [N] with which the sample pushes frictionless plates apart before relaxation. `radius`: radius
-    of the sample at rest [m]."""
+    """Return the force [N] with which the sample pushes frictionless plates apart before relaxation. With a negative
+    `strain` (tension), the force is negative too. `radius`: radius of the sample at rest [m]."""
     if strain == 0:
         return 0.0
     a = side_stretch(law, strain)
@@ -156,12 +158,17 @@ def compressed(rig: Rig, law: Law, strain: float, smooth: bool = False) -> Rig:
             Otherwise, the sample is glued and bulges.
 
     Raises:
-        InputError: the simulation does not converge at this compression, `strain` is out of range, or (if `smooth`) the
-            law is not isotropic.
+        InputError: the simulation does not converge at this compression, `strain` is out of range, the height of the
+            rig is free, or (if `smooth`) the law is not isotropic.
     """
     check_strain(strain)
     if strain == 0:
         return rig
+    if rig.free_height:
+        raise InputError(
+            f"free_height = True and a compression by {strain:g} exclude each other, because a plate without axial "
+            "force does not hold the sample compressed: make the rig with free_height = False"
+        )
     X = rig.mesh.points
     gap = rig.height * (1 - strain)
     if smooth:
