@@ -95,6 +95,41 @@ def test_right_inputs_are_fitted():
     scene_numbers.check_data(measured(1, 7))
 
 
+SPONGE = lj.Porosity(bulk=400.0, limit_bulk=2200.0, fluid_fraction=0.5, permeability=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "truth", "expected"),
+    [("fluid_fraction", 1.1, 1.0), ("fluid_fraction", 0.8, 0.8), ("limit_bulk", 300, 300)],
+)
+def test_a_fit_respects_the_bounds_of_a_porous_body(name, truth, expected, monkeypatch, recwarn):
+    """A fluid fraction above 1 was a result without a warning, or an error at the end of the fit."""
+    problem = measured(1, 7)
+    timed = replace(problem.scenes[0], porosity=SPONGE, solve=lj.Solve(dt=1.0, steps=2))
+    problem = problem._replace(scenes=(timed,))
+
+    def misfit(problem, values):
+        off = values[f"porosity.{name}"] / truth - 1
+        return 100 * off * jnp.array([1.0, 0.9, 1.1]), jnp.zeros(1, int)
+
+    monkeypatch.setattr(scene_numbers, "misfit", misfit)
+    possible, at_bound = name != "limit_bulk", truth == 1.1
+    found = scene_numbers.fit_numbers(problem, [f"porosity.{name}"], mesh_error=not possible)
+    assert np.isclose(found.values[0], expected, rtol=1e-5) and (found.values[0] <= 1 or not possible)
+    told = [str(w.message) for w in recwarn]
+    assert found.converged != at_bound and told == list(found.warnings) and len(told) == (at_bound or not possible)
+    assert possible or "limit_bulk = 300 must be above bulk = 400" in told[0]
+    assert not at_bound or "the upper bound of a parameter (porosity.fluid_fraction = 1)" in told[0]
+
+
+def test_errors_of_a_scene_that_is_not_possible_are_unknown():
+    problem = measured(1, 7)
+    timed = replace(problem.scenes[0], porosity=SPONGE, solve=lj.Solve(dt=1.0, steps=2))
+    with pytest.warns(UserWarning, match="the effect of the ") as told:
+        found = scene_numbers.discretisation_errors(problem._replace(scenes=(timed,)), {"porosity.limit_bulk": 300.0})
+    assert found == (None, None) and len(told) == 2
+
+
 def test_strains_may_have_any_order():
     strains, storage = np.array([1e-3, 1e-2, 0.1, 0.3]), np.array([1000.0, 995, 960, 700])
     limit = torsion.linearity_limit(strains, storage)

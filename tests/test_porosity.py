@@ -41,6 +41,16 @@ def test_volumetric_stress_and_its_tangent_line():
     assert np.isclose(jax.grad(lambda J: porosity.volumetric_stress(SPONGE, J))(1.0), 400.0)
 
 
+def test_stress_and_energy_in_float32_with_a_high_limit():
+    """K0/K_lim was lost beside 1, so that the energy was NaN for every J."""
+    high, J = replace(SPONGE, bulk=100.0, limit_bulk=2.2e9), jnp.linspace(0.4, 1.3, 10)  # J[1] is about J0 = 0.5
+    single_precision = jax.tree.map(np.float32, high)
+    for function in (porosity.volumetric_energy, porosity.volumetric_stress, porosity.volumetric_slope):
+        single = np.asarray(function(single_precision, J.astype(jnp.float32)))
+        assert single.dtype == np.float32 and np.all(np.isfinite(single))
+        np.testing.assert_allclose(single[2:], function(high, J[2:]), rtol=1e-5, atol=1e-5)
+
+
 def column(layers: int, steps: int, duration: float, scheme: str = "implicit", **changes) -> lj.Scene:
     """Confined compression, drained at the top; `duration` in diffusion times."""
     sides = [{"set": name, "axes": name[0]} for name in ("x_min", "x_max", "y_min", "y_max")]
@@ -232,6 +242,28 @@ def test_only_a_porous_scene_has_pressure():
 def test_unusable_porosity_is_refused(change, sentence):
     with pytest.raises(lj.InputError, match=sentence):
         column(1, 1, 1.0, **change)
+
+
+def test_a_number_of_a_porous_body_with_a_wrong_shape_is_refused():
+    """Such a number was an error of JAX during the run."""
+    scene = column(1, 1, 1.0)
+    wrong = replace(scene, porosity=replace(scene.porosity, bulk=jnp.full(5, 400.0)))
+    region = lj.Region(elements=jnp.arange(2), porosity={"bulk": 500.0})
+    for own in (wrong, replace(wrong, region=(region,))):
+        with pytest.raises(lj.InputError, match=r"porosity\.bulk has shape \(5,\): give one number or shape \(6,\)"):
+            lj.simulate(own)
+
+
+def test_the_least_eigenvalue_does_not_depend_on_the_shape_of_the_permeability():
+    """Values at the integration points were an error."""
+    mesh = lj.quadratic(lj.shapes.box((0.1, 0.1, 0.1), (1, 1, 1)))
+    store, diagonal = np.array([1.0, 2.0]), np.array([3.0, 5.0])
+    of_elements = np.arange(1.0, 1 + mesh.number_of_elements)
+    (one, *others) = (
+        darcy._least_eigenvalue(mesh, rate, store, diagonal)
+        for rate in (of_elements[None], np.broadcast_to(of_elements, mesh.weights.shape))
+    )
+    assert np.allclose(others, one, rtol=1e-12)
 
 
 @pytest.mark.ci

@@ -252,6 +252,9 @@ def test_pressures_between_drained_nodes_and_inlets_are_known(order):
     y, known, given = pressures(drained=None, inlet=(rest, at_row))
     assert known.sum() == 25 and np.allclose(given[known & (np.abs(y[:, 0] - 0.075) < 0.01)], 1.5)
     assert pressures(drained=None, inlet=(rest, replace(at_row, history=jnp.ones(2))))[1].sum() == 20
+    # The row of the inlet is also drained: the pressure of the new nodes beside this row was 0.
+    y, known, given = pressures(drained=top, inlet=(at_row,))
+    assert known.sum() == 25 and np.allclose(given, np.where(known, np.clip((y[:, 0] - 0.05) / 0.05, 0.0, 1.0) * 2, 0))
 
 
 @pytest.mark.parametrize("low", [100.0, 500.0])

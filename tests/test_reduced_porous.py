@@ -105,11 +105,27 @@ def test_storage_at_vertices_is_that_of_the_points(order):
     F = fluid_at_rest(model, scene).F + 0.02 * rng.normal(size=(9, len(model.points)))
     sponge = reduced_sponge(model, scene)
     own = reduced_fluid._stored_at_vertices(model, sponge, determinant(as_matrix(F)))
-    stores = storage_and_flow(model, sponge.porosity, F, 0.05)[0]
+    stores = storage_and_flow(model, sponge.porosity, F)[0]
     exact = np.einsum("kas,las->kl", stores, stores)
     np.testing.assert_allclose(own, exact, rtol=1e-13, atol=1e-13 * np.abs(exact).max())
     one = _at(model, np.arange(1), model.weights[:1])
     assert reduced_sponge(one, scene).lumped is None  # fewer points than vertices
+
+
+def test_derivatives_without_flow_are_finite():
+    """They were NaN, because a square root contained the permeability."""
+    scene = _sponge((1, 1, 1), permeability=0.0)
+    model = _whole(scene)
+    sponge, rest = reduced_sponge(model, scene), fluid_at_rest(model, scene)
+
+    @jax.jit
+    def inverse(kappa, size):
+        own = sponge._replace(porosity=replace(sponge.porosity, permeability=kappa))
+        return jnp.sum(flowing(model, own, rest._replace(F=size * rest.F), 0.05).inverse)
+
+    slopes = jax.jit(jax.grad(inverse, (0, 1)))(0.0, 0.9)
+    assert np.isclose(slopes[0], (inverse(1e-9, 0.9) - inverse(0.0, 0.9)) / 1e-9, rtol=1e-2) and slopes[0] < 0
+    assert np.isclose(slopes[1], (inverse(0.0, 0.901) - inverse(0.0, 0.899)) / 2e-3, rtol=1e-3)
 
 
 @pytest.mark.ci

@@ -12,6 +12,7 @@ from fitting.rigs import glued
 from fitting.rigs.time_steps import change_with_small_steps, order_of_steps
 from liverjax.core.struct import replace
 from liverjax.physics.rigid_plate import RigidPlate
+from liverjax.solvers.problem import StepStatistics
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -76,6 +77,21 @@ def test_a_constant_load_has_an_error_of_first_order():
         assert order_of_steps(replace(unloaded, displaced=(moved,))) == order
         assert order_of_steps(replace(unloaded, physics=(plate,))) == order
     assert order_of_steps(unloaded) == order_of_steps(replace(block(0.1, 6, rise=None), viscosity=None)) == 2
+
+
+def test_readings_may_use_every_field_of_a_run(monkeypatch):
+    """Only positions and reactions of the fine run were those at the ends of the coarse steps."""
+
+    def simulated(scene):
+        steps, of_steps = scene.solve.steps, np.zeros(scene.solve.steps, int)
+        times, moved = scene.solve.dt * np.arange(1, steps + 1), np.zeros((steps, 1, 3))
+        statistics = StepStatistics(*[of_steps] * len(StepStatistics._fields))
+        parts = {"positions": moved, "reactions": moved, "pressure": np.exp(-times)[:, None]}
+        return lj.Result(times=times, status=of_steps, statistics=statistics, **parts)
+
+    monkeypatch.setattr(lj, "simulate", simulated)
+    found = change_with_small_steps(block(0.1, 2), lambda run: run.times + run.pressure.max(axis=1))
+    assert np.array_equal(found, np.zeros(2))  # the pressure is exact at the ends of all steps
 
 
 def test_a_run_that_fails_gives_no_estimate():

@@ -19,8 +19,10 @@ from fitting.readers.displacements import Displacements, weighted_differences
 from fitting.rigs.time_steps import change_with_small_steps
 from liverjax.core import status
 from liverjax.core.errors import InputError
+from liverjax.core.names import metadata
 from liverjax.core.struct import Content, replace
 from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.scenes.checks.numbers import check_bounds
 from liverjax.scenes.scene import Scene, numbers_at
 from liverjax.simulation.automatic import with_solver
 from liverjax.simulation.mesh_error import mesh_error_of
@@ -132,12 +134,28 @@ def fit(
     estimate = estimated(names, natural_of, found, problem.components)
     estimate = _of_alike_noise(problem, natural_of, found, estimate)
     known = np.all(np.isfinite(estimate.standard_errors))  # an infinite error means that a parameter ran to a limit
-    if mesh_error and known:
+    values = values_of(found.u)
+    refused = _refused(problem, values) if known else None
+    if refused is not None:
+        warnings.warn(refused, stacklevel=2)
+        estimate = estimate._replace(warnings=(*estimate.warnings, refused))
+    elif mesh_error and known:
         finer = None if at_points is None else partial(at_points, found.u)
-        estimate = _of_discretisation(problem, (values_of(found.u), finer), (estimate, found, natural_of))
+        estimate = _of_discretisation(problem, (values, finer), (estimate, found, natural_of))
         for sentence in bias_sentences(estimate):
             warnings.warn(sentence, stacklevel=2)
     return estimate._replace(converged=converged, codes=ended, seconds=seconds), found
+
+
+def _refused(problem: Problem, values: Content) -> str | None:
+    """Return a warning if a scene with the fitted parameters `values` is not allowed, otherwise None. The search does
+    not see this, because the parameters are unknown inside jit."""
+    try:
+        for scene in problem.scenes:
+            check_bounds(lj.with_parameters(scene, values))
+    except InputError as e:
+        return f"the fitted parameters are not possible, so the data or other parameters of the scene are wrong: {e}"
+    return None
 
 
 def _of_discretisation(
@@ -232,8 +250,8 @@ def discretisation_errors(problem: Problem, values: Content, finer: Finer | None
     timed = any(scene.solve.dt is not None for scene in problem.scenes)
     if timed and not np.all(np.isfinite(of_steps)):
         warnings.warn(
-            "the effect of the time step on the fit is unknown: a run with this step, or with half of it, did not "
-            "converge",
+            "the effect of the time step on the fit is unknown: a run with this step, or with half of it, is not "
+            "allowed or did not converge",
             stacklevel=3,
         )
     known = Discretisation(of_mesh, of_steps if timed else None)
@@ -257,8 +275,12 @@ def _errors_in(scene: Scene, data: Displacements, finer: Finer | None) -> tuple[
         run, of_mesh, cause = None, np.full(np.size(data.measured), np.nan), str(e)
     if not np.all(np.isfinite(of_mesh)):
         warnings.warn(f"the effect of the mesh error on the fit is unknown: {cause}", stacklevel=4)
-    steady = scene.solve.dt is None
-    return of_mesh, np.zeros_like(of_mesh) if steady else change_with_small_steps(scene, readings, run)
+    if scene.solve.dt is None:
+        return of_mesh, np.zeros_like(of_mesh)
+    try:
+        return of_mesh, change_with_small_steps(scene, readings, run)
+    except InputError:
+        return of_mesh, np.full_like(of_mesh, np.nan)
 
 
 def _all_differences(data: Displacements, scene: Scene, result: lj.Result) -> jax.Array:
@@ -284,9 +306,55 @@ def with_discretisation_as_noise(problem: Problem) -> tuple[Problem, list[dict[s
     return problem._replace(data=tuple(data)), sizes
 
 
+#: If a parameter with an upper bound begins nearer to the bound than this fraction of it, the search begins at this
+#: distance. At the bound itself, the derivative of the parametrisation is 0.
+_FROM_BOUND = 0.02
+
+
+def _upper_bound(scene: Scene, name: str) -> float:
+    """Return the upper bound of the field with a dotted name, or infinity."""
+    bound = metadata(scene, name, name).get("upper")
+    return float(bound) if isinstance(bound, int | float) else np.inf
+
+
+def _in_bounds(starts: np.ndarray, upper: np.ndarray) -> Callable[[jax.Array], jax.Array]:
+    """Return the function from the unknowns u (n,) to the parameters (n,), which are `starts` (n,) for u = 0. Positive
+    parameters stay positive and below their bounds `upper` (n,), which are infinite if there are none."""
+    positive, bounded = starts > 0, (starts > 0) & np.isfinite(upper)
+    top = np.where(bounded, upper, 1.0)
+    begin = np.sqrt(np.maximum(np.log(top / np.where(bounded, starts, 1.0)), _FROM_BOUND))
+
+    def natural_of(u):
+        free = jnp.where(positive, starts * jnp.exp(jnp.where(positive & ~bounded, u, 0.0)), starts + u)
+        return jnp.where(bounded, top * jnp.exp(-((begin - u) ** 2)), free)
+
+    return natural_of
+
+
+#: A fitted parameter is at its upper bound if its distance from the bound is at most this fraction of its standard
+#: error.
+_AT_BOUND = 0.01
+
+
+def _told_of_bounds(found: Estimate, upper: np.ndarray) -> Estimate:
+    """Return the estimate. If a parameter is at its bound in `upper` (n,), a warning is given and added."""
+    errors = np.where(np.isfinite(found.standard_errors), found.standard_errors, 0.0)
+    (places,) = np.nonzero(np.isfinite(upper) & (upper - found.values <= _AT_BOUND * errors))
+    if not len(places):
+        return found
+    each = ", ".join(f"{found.names[k]} = {upper[k]:g}" for k in places)
+    sentence = (
+        f"the fit ended at the upper bound of a parameter ({each}), where the search cannot converge: give this value "
+        "in the scene and fit the other parameters, or check the data and the scene"
+    )
+    warnings.warn(sentence, stacklevel=3)
+    return found._replace(warnings=(*found.warnings, sentence))
+
+
 def fit_numbers(problem: Problem, names: Sequence[str], **options: Any) -> Estimate:
     """Fit the parameters of the scenes with the dotted names `names`, for example law.mu. Positive parameters stay
-    positive.
+    positive, and do not exceed the upper bounds of their fields. A warning is given if a parameter is at its upper
+    bound, or if the result is not possible, for example because limit_bulk is not above bulk.
 
     Raises:
         InputError: a scene has no parameter of this name, or the parameter is not a floating-point number.
@@ -299,11 +367,8 @@ def fit_numbers(problem: Problem, names: Sequence[str], **options: Any) -> Estim
         for name, v in zip(names, starts, strict=True)
         for i in range(np.size(v))
     ]
-    positive = jnp.asarray(flat > 0)
-    base = jnp.asarray(flat)
-
-    def natural_of(u):
-        return jnp.where(positive, base * jnp.exp(jnp.where(positive, u, 0.0)), base + u)
+    upper = np.repeat([_upper_bound(problem.scenes[0], name) for name in names], sizes)
+    natural_of = _in_bounds(flat, upper)
 
     def values_of(u):
         p, out, k = natural_of(u), {}, 0
@@ -314,4 +379,5 @@ def fit_numbers(problem: Problem, names: Sequence[str], **options: Any) -> Estim
         return out
 
     lj.with_parameters(problem.scenes[0], dict(zip(names, starts, strict=True)))
-    return fit(problem, Unknowns(np.zeros(len(flat)), values_of, natural_of, labels), **options)[0]
+    found = fit(problem, Unknowns(np.zeros(len(flat)), values_of, natural_of, labels), **options)[0]
+    return _told_of_bounds(found, upper)

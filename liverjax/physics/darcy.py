@@ -84,13 +84,13 @@ def _least_eigenvalue(mesh: TetMesh, rate: Number, store: jax.Array, diagonal: j
     """Estimate the minimum eigenvalue of D^-1 A outside the coarse space, with the diagonal D of A.
 
     The coarse space is that of the preconditioner. `rate` is the time step dt times the permeability kappa: one number,
-    or one per element (E,).
+    one per element (E,) or (1, E), or one for each of Q integration points of the elements (Q, E).
     """
     stored, total = jnp.sum(store), jnp.sum(diagonal)
     if jnp.ndim(rate):
         # The elements with the largest dt kappa determine the minimum eigenvalue. So this value is used for the whole
         # body.
-        fastest, mean = jnp.max(rate), jnp.sum(jnp.ravel(rate) * mesh.volumes) / jnp.sum(mesh.volumes)
+        fastest, mean = jnp.max(rate), jnp.sum(rate * mesh.weights) / jnp.sum(mesh.volumes)
         total, rate = stored + (total - stored) * fastest / jnp.where(mean > 0, mean, 1.0), fastest
     # The numerator of the estimate is the storage plus the Darcy flow of a pressure wave with wave number 5 / (width of
     # a patch of the coarse space). In numerical tests, this number was 4.9 to 5.4 instead of 5. The coarse space

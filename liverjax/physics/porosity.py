@@ -206,6 +206,14 @@ def bulk_in_force(porosity: Porosity, law: Law) -> str:
     return f"{sponge}, plus the part of {names} that is not separate from shear{off}"
 
 
+def _fluid_ratio(porosity: Porosity, J: Number) -> jax.Array:
+    """Return u = (r_w + J - 1)/r_w, or the value K0/K_lim of u at J0 if this is larger.
+
+    In single precision, J0 may round to 1 - r_w. Without the bound K0/K_lim, u would then be 0, and ln u infinite.
+    """
+    return jnp.maximum(1 + (J - 1) / porosity.fluid_fraction, porosity.bulk / porosity.limit_bulk)
+
+
 def volumetric_stress(porosity: Porosity, J: Number) -> Number:
     """Return the stress sigma_Heq(J) [Pa]: Hencky's logarithm above J0, and its tangent line below J0.
 
@@ -213,15 +221,16 @@ def volumetric_stress(porosity: Porosity, J: Number) -> Number:
     """
     K0, K_lim, r_w = porosity.bulk, porosity.limit_bulk, porosity.fluid_fraction
     J0 = 1 - r_w + r_w * K0 / K_lim
-    logarithm = K0 * r_w * jnp.log1p((jnp.maximum(J, J0) - 1) / r_w)
-    return logarithm + K_lim * jnp.minimum(J - J0, 0.0)
+    u = _fluid_ratio(porosity, J)
+    logarithm = jnp.where(u > 0.5, jnp.log1p(jnp.maximum((J - 1) / r_w, -0.5)), jnp.log(u))
+    return K0 * r_w * logarithm + K_lim * jnp.minimum(J - J0, 0.0)
 
 
 def volumetric_slope(porosity: Porosity, J: Number) -> jax.Array:
     """Return the derivative d sigma_Heq / dJ [Pa] of the volumetric stress with respect to the volume ratio J."""
     K0, K_lim, r_w = porosity.bulk, porosity.limit_bulk, porosity.fluid_fraction
     J0 = 1 - r_w + r_w * K0 / K_lim
-    return jnp.where(J > J0, K0 / (1 + (jnp.maximum(J, J0) - 1) / r_w), K_lim)
+    return jnp.where(J > J0, K0 / _fluid_ratio(porosity, J), K_lim)
 
 
 def volumetric_energy(porosity: Porosity, J: Number) -> Number:
@@ -232,9 +241,10 @@ def volumetric_energy(porosity: Porosity, J: Number) -> Number:
     """
     K0, K_lim, r_w = porosity.bulk, porosity.limit_bulk, porosity.fluid_fraction
     J0 = 1 - r_w + r_w * K0 / K_lim
-    u = 1 + (jnp.maximum(J, J0) - 1) / r_w
+    u = _fluid_ratio(porosity, J)
     below = jnp.minimum(J - J0, 0.0)
-    return K0 * r_w**2 * (u * jnp.log(u) - u + 1) + below * (volumetric_stress(porosity, J0) + 0.5 * K_lim * below)
+    at_J0 = K0 * r_w * jnp.log(K0 / K_lim)  # the stress
+    return K0 * r_w**2 * (u * jnp.log(u) - u + 1) + below * (at_J0 + 0.5 * K_lim * below)
 
 
 def initial_fluid(porosity: Porosity, mesh: TetMesh) -> Fluid:

@@ -183,15 +183,16 @@ def _balance(
     assert modes is not None
     dt = jnp.asarray(scene.solve.dt)
     inverse = flowing(whole, reduced_sponge(whole, scene), rest, dt).inverse
+    rate = jnp.broadcast_to(dt * sponge.permeability, whole.weights.shape)
 
     def of_step(k: jax.Array) -> jax.Array:
         first, last = k == 0, jnp.maximum(k - 1, 0)
         F, F_before = gradient(k), jnp.where(first, rest.F, gradient(last))
         J, J_before = (determinant(as_matrix(each)) for each in (F, F_before))
-        store, flow = storage_and_flow(whole, sponge, F_before, dt)
+        store, slopes = storage_and_flow(whole, sponge, F_before)
         more = p[k] - jnp.where(first, rest.pressure, p[last])
         stored = jnp.einsum("kas,as->ks", store, jnp.tensordot(more, store, axes=1))
-        flows = jnp.einsum("kas,as->ks", flow, jnp.tensordot(p[k], flow, axes=1))
+        flows = rate[None] * jnp.einsum("kas,as->ks", slopes, jnp.tensordot(p[k], slopes, axes=1))
         change = (whole.weights * (J - J_before))[None] * modes.values.T
         return jnp.stack([inverse @ change, inverse @ (stored + flows)])
 

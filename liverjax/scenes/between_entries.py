@@ -80,20 +80,24 @@ def joined_entries(
 def joined_inlets(old: Scene, made: Porosity) -> tuple[Inlet, ...]:
     """Return the inlets of `made`, and inlets for the new vertices between drained nodes and inlets of `old`.
 
-    `made` is the porosity on the refined mesh. A new vertex has the mean pressure of the ends of its edge. Between two
-    inlets with different histories, its pressure is unknown. If the positions of the mesh are unknown (inside jit, grad
-    or vmap), no inlet is added.
+    `made` is the porosity on the refined mesh. A new vertex has the mean pressure of the ends of its edge, also if an
+    entry of `made` gives it another pressure, since entries with common nodes overlap. Between two inlets with
+    different histories, no pressure is added. If the positions of the mesh are unknown (inside jit, grad or vmap), no
+    inlet is added.
     """
     mesh, V = old.mesh, old.mesh.number_of_vertices
     given, taken = ([] if s is None else _given_pressures(s) for s in (old.porosity, made))
     if isinstance(mesh.points, jax.core.Tracer) or len(given) < 2:
         return made.inlet
-    new = middles_between(mesh, [nodes for _, nodes in given])
-    new = np.setdiff1d(new, np.concatenate([nodes for _, nodes in taken]))
-    owner = np.full(V, -1)
-    for k, (_, nodes) in enumerate(given):  # where two inlets have a common node, the later one counts
-        owner[nodes[nodes < V]] = k
-    ends = np.sort(owner[np.asarray(mesh.pattern.edges)[:, new - V]], axis=0)
+    edges = np.asarray(mesh.pattern.edges)
+    owner, by_made = np.full(V, -1), np.full(V + edges.shape[1], -1)
+    for k, ((_, nodes), (_, wider)) in enumerate(zip(given, taken, strict=True)):
+        owner[nodes[nodes < V]] = k  # where two inlets have a common node, the later one counts
+        by_made[wider[wider < len(by_made)]] = k
+    new = np.union1d(middles_between(mesh, [nodes for _, nodes in given]), V + np.flatnonzero(by_made[V:] >= 0))
+    ends = np.sort(owner[edges[:, new - V]], axis=0)
+    missing = np.all(ends >= 0, axis=0) & np.any(ends != by_made[new], axis=0)
+    new, ends = new[missing], ends[:, missing]
     more = []
     for k, m in np.unique(ends, axis=1).T:
         own = node_numbers(new[(ends[0] == k) & (ends[1] == m)])

@@ -107,23 +107,26 @@ def flowing(model: ReducedModel, sponge: ReducedSponge, memory: ReducedFluid, dt
     step."""
     assert model.pressures is not None
     porosity, lumped, J = sponge.porosity, sponge.lumped, determinant(as_matrix(memory.F))
-    stores, flows = storage_and_flow(model, porosity, memory.F, dt)
-    store, flow = _squares(stores) if lumped is None else _stored_at_vertices(model, sponge, J), _squares(flows)
+    stores, slopes = storage_and_flow(model, porosity, memory.F)
+    store = _products(stores, stores) if lumped is None else _stored_at_vertices(model, sponge, J)
+    flow = _products(jnp.broadcast_to(dt * porosity.permeability, J.shape)[None, None] * slopes, slopes)
     averages, stored = model.weights[:, None] * model.pressures.values, store @ memory.pressure
     if memory.J_before is not None:
         stored = stored - (J - memory.J_before) @ averages
     return Flowing(porosity, jnp.linalg.inv(store + flow), stored, averages, J)
 
 
-def storage_and_flow(model: ReducedModel, porosity: Porosity, F: jax.Array, dt: Number) -> tuple[jax.Array, jax.Array]:
-    """Return vectors (m, 4, S) and (m, 3, S) [Pa^-0.5] for m pressure modes and S points. Their scalar products
-    are the matrices S and dt D (module docstring), for a step that begins with the deformation gradients F (9, S)."""
+def storage_and_flow(model: ReducedModel, porosity: Porosity, F: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return vectors (m, 4, S) [Pa^-0.5] and (m, 3, S) [1/m] for m pressure modes and S points. The scalar products of
+    the first vectors are the matrix S (module docstring), for a step that begins with the deformation gradients F
+    (9, S). The scalar products of the second vectors, with the factor kappa at each point, are the matrix D."""
     modes, w = model.pressures, model.weights
     assert modes is not None
     matrix = as_matrix(F)
     volume = w * jnp.maximum(determinant(matrix), darcy.LEAST_J)
     # In the current shape, grad psi = cof(F) G / J with the reference gradient G, and the volume is J w (`darcy.flow`).
-    root = jnp.sqrt(dt * porosity.permeability * w**2 / volume)
+    # The root does not contain kappa, because the slope of a root is infinite at 0.
+    root = jnp.sqrt(w**2 / volume)
     scaled = tuple(tuple((root * entry)[None] for entry in row) for row in cofactor(matrix))
     g = matvec(scaled, tuple(jnp.moveaxis(modes.slopes, 1, 0)))
     return jnp.sqrt(volume / porosity.limit_bulk)[None, None] * modes.parts, jnp.stack(g, axis=1)
@@ -139,10 +142,9 @@ def _stored_at_vertices(model: ReducedModel, sponge: ReducedSponge, J: jax.Array
     return (modes.modes * of_vertices[None]) @ modes.modes.T
 
 
-def _squares(a: jax.Array) -> jax.Array:
-    """Return the scalar products (m, m) of m vectors, which are the arrays (k, S) in `a` (m, k, S)."""
-    flat = a.reshape(a.shape[0], -1)
-    return flat @ flat.T
+def _products(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Return the scalar products (m, m) of m vectors with m others: the arrays (k, S) in `a` and `b` (m, k, S)."""
+    return a.reshape(a.shape[0], -1) @ b.reshape(b.shape[0], -1).T
 
 
 def pressure_coordinates(own: Flowing, J: jax.Array) -> jax.Array:

@@ -4,9 +4,10 @@ The mesh is not checked.
 """
 
 from liverjax.core import bounds
+from liverjax.mesh.shape_functions import basis
 from liverjax.physics import porosity, viscosity
 from liverjax.scenes.checks.regions import check_region_numbers
-from liverjax.scenes.regions import laws_of
+from liverjax.scenes.regions import POROUS, laws_of
 from liverjax.scenes.scene import Scene, named_physics
 from liverjax.scenes.springpots import check_springpots
 
@@ -18,8 +19,9 @@ def check_bounds(scene: Scene) -> None:
     `check_mesh`.
 
     Raises:
-        InputError: a number is outside its bounds, or a direction has length 0. For a number outside its bounds, the
-            message contains its name (for example law.mu), its value, its bound and a remedy.
+        InputError: a number is outside its bounds, a direction has length 0, or a number of [porosity] has a wrong
+            shape. For a number outside its bounds, the message contains its name (for example law.mu), its value, its
+            bound and a remedy.
     """
     bounds.check_fields(scene, leave=("mesh", "physics"))
     for name, physics in named_physics(scene):
@@ -30,6 +32,10 @@ def check_bounds(scene: Scene) -> None:
     if scene.viscosity is not None:
         viscosity.check_series(scene.viscosity)
     if scene.porosity is not None:
+        E, order = scene.mesh.number_of_elements, scene.mesh.order
+        of_points = () if order == 1 else ((1, E), (len(basis(order).weights), E))
+        for name in POROUS:
+            bounds.check_shape(f"porosity.{name}", getattr(scene.porosity, name), (), (E,), *of_points)
         porosity.check_limit(scene.porosity)
     check_region_numbers(scene)
 
