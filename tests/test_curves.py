@@ -18,6 +18,7 @@ from fitting.fits import stress_stretch
 from fitting.fits.families import compared_laws, hyperelastic
 from fitting.readers import curves
 from fitting.reports import curves_report
+from liverjax.core import names
 from liverjax.laws import homogeneous
 
 pytestmark = pytest.mark.quick_to_compile
@@ -178,6 +179,22 @@ def test_laws_that_add_up_are_fitted_together(tmp_path, capsys):
         assert main(["curves", f"{file}:{name}", str(DATA / "rubber_curves.csv")]) == 2
         error = capsys.readouterr().err
         assert sentence in error and error.count("\n") == 1
+
+
+def test_the_names_in_a_sum_are_those_of_a_scene(tmp_path):
+    """The places did not count a law that has only U(J), and the terms of Ogden's law were `1.mu[0]`."""
+    file = tmp_path / "sums.py"
+    file.write_text(
+        "from liverjax import laws\n"
+        "first = laws.Volumetric(bulk=7700.0) + laws.FungDemiray(c1=500.0, c2=1.0, bulk=None)\n"
+        "second = first + laws.Ogden(mu=(1.0,), alpha=(2.0,), bulk=None)\n"
+    )
+    (first,), (second,) = (stress_stretch.candidates(f"{file}:{name}") for name in ("first", "second"))
+    assert first.names == ("1.c1", "1.c2")
+    assert second.names == ("1.c1", "1.c2", "2.mu.0", "2.alpha.0")
+    law = lj.laws.Volumetric(bulk=7700.0) + second.law(jnp.array([500.0, 1.0, 3.0, 2.0]))
+    assert [float(names.get(law, name, "law")) for name in second.names] == [500.0, 1.0, 3.0, 2.0]
+    assert stress_stretch.candidates("ogden", 1)[0].names == ("mu[0]", "alpha[0]")
 
 
 def test_coefficients_that_are_given_are_fitted_and_the_others_named(tmp_path):

@@ -302,3 +302,18 @@ def test_the_terms_of_the_chapter_know_the_continued_volume():
     F = unpack(jnp.diag(jnp.array([1.0, 1.0, 0.3])))
     P, of_chapter = (np.asarray(pack(terms.first_piola(law, F))) for terms in (invariant_terms, chapter_terms))
     assert np.allclose(of_chapter, P, rtol=1e-12)
+
+
+def test_a_modulus_in_another_unit_than_pascal_is_refused():
+    """`scaled` did not multiply a modulus in kPa, so such a law did not relax."""
+    with pytest.raises(lj.InputError, match=r"Soft\.mu has the unit 'kPa': declare the unit Pa"):
+
+        @lj.struct
+        class Soft(lj.Law):
+            mu: float = lj.param("kPa", typical=0.77)
+
+
+def test_a_law_of_ogden_without_terms_is_refused():
+    """Such a law was made, with the shear modulus 0."""
+    with pytest.raises(lj.InputError, match="give at least one term"):
+        lj.laws.create("ogden", mu=[], alpha=[], bulk=7700.0)

@@ -366,3 +366,23 @@ def test_terms_of_a_law_are_not_values_of_elements():
         for body, own in ((fine, law), (mesh, split)):
             whole = mjed.energy(body, same, body.points @ F.T)
             assert np.isclose(mjed.energy(body, own, body.points @ F.T), whole, rtol=1e-12)
+
+
+def test_a_negative_shear_modulus_is_refused_only_if_the_whole_law_has_it():
+    """Scenes with such laws were accepted."""
+    content = {
+        "mesh": {"shape": "box", "size": [1.0, 1.0, 1.0], "cells": [1, 1, 2]},
+        "law": {"name": "mooney_rivlin", "c10": 300.0, "c01": -85.0, "bulk": 7700.0},
+        "fixed": [{"where": {"z_max": 0.0}}],
+    }
+    soft, top = {"name": "bogen", "mu": -400.0, "alpha": 4.0, "bulk": 7700.0}, {"where": {"z_min": 0.5}}
+    scene_from(content)
+    scene_from(content | {"law": [{"name": "neo_hookean", "mu": 900.0, "bulk": 7700.0}, soft]})
+    for wrong in (
+        {"law": soft},
+        {"law": [{"name": "neo_hookean", "mu": 700.0, "bulk": 7700.0}, soft]},
+        {"region": [top | {"law": {"c10": 50.0}}]},
+        {"region": [top | {"law": soft}]},
+    ):
+        with pytest.raises(lj.InputError, match="must not be negative: change its parameters"):
+            scene_from(content | wrong)

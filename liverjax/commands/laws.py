@@ -17,7 +17,8 @@ def add(parsers: argparse._SubParsersAction) -> None:
 def run(options: argparse.Namespace) -> int:
     """Print every law."""
     print(f"option of every law with the parameter bulk: volumetric = {' | '.join(VOLUMETRIC)} (default quadratic)")
-    print("option of every law of I1, I2 and J: continued_below = 0.1, for a finite energy below this J (default off)")
+    print("option of every law of I1, I2 and J: continued_below = 0.1, for a finite energy below this J (default off;")
+    print("    an exponential law can still exceed the largest number of float32 there)")
     for name, cls in laws.LAWS.items():
         energy = (cls.__doc__ or name).split("\n\n")[0].splitlines()
         print("\n".join([name, *(f"    {line.strip()}" for line in energy)]))

@@ -95,7 +95,10 @@ class Continued(Law):
 
 
 def continued(law: Law, below: float) -> Law:
-    """Return the law with finite energy and forces for every J. It is the same law above J = `below` (see `Continued`).
+    """Return the law with an energy that is defined for every J. It is the same law above J = `below` (`Continued`).
+
+    Below c, the isochoric invariants grow while J decreases. So an exponential of them can exceed the largest
+    floating-point number, for example in float32 at J = -1. Energy and forces are then infinite or NaN.
 
     Args:
         law: a law of I1, I2 and J, or a sum of such laws.

@@ -106,7 +106,6 @@ def check_scene(scene: Scene) -> None:
     check_choices(scene)
     check_numbers(scene)
     check_mesh(scene.mesh)
-    check_region_elements(scene)
     check_places(scene)
     check_physics(scene)
     check_normals(scene)

@@ -54,18 +54,23 @@ def candidates(name: str, terms: int | None = None) -> list[Candidate]:
 
 def _candidate(label: str, law: Law) -> Candidate:
     """Return the candidate for one law, or for a sum of laws."""
-    parts = [s for s in laws.summands(law) if not isinstance(s, laws.Volumetric)]
-    if len(parts) > 1:
-        return _sum(label, [_candidate(f"{label}, summand {k}", s) for k, s in enumerate(parts)])
-    (law,) = parts
+    if isinstance(law, laws.Sum):
+        shaped = {k: s for k, s in enumerate(laws.summands(law)) if not isinstance(s, laws.Volumetric)}
+        return _sum(label, {k: _candidate(f"{label}, summand {k}", s) for k, s in shaped.items()})
     if isinstance(law, laws.Ogden):
         return _ogden(len(law.alpha))._replace(label=label)
     return _bogen()._replace(label=label) if isinstance(law, laws.Bogen) else _single(label, law)
 
 
-def _sum(label: str, parts: list[Candidate]) -> Candidate:
+def _sum(label: str, numbered: dict[int, Candidate]) -> Candidate:
     """Return the candidate for a sum of laws. The parameters have the same names as in a scene. For example, `1.mu` is
-    the parameter mu of the second law."""
+    the parameter mu of the second law, and `2.mu.0` the first mu of the third law.
+
+    Args:
+        label: label of the candidate.
+        numbered: place in the sum -> candidate. A law that has only U(J) has no candidate.
+    """
+    parts = list(numbered.values())
     ends = np.cumsum([len(p.names) for p in parts])[:-1]  # there are as many unconstrained variables as parameters
 
     def values(u, scale):
@@ -79,7 +84,7 @@ def _sum(label: str, parts: list[Candidate]) -> Candidate:
 
     return Candidate(
         label,
-        tuple(f"{k}.{name}" for k, p in enumerate(parts) for name in p.names),
+        tuple(f"{k}.{name.replace('[', '.').rstrip(']')}" for k, p in numbered.items() for name in p.names),
         tuple(unit for p in parts for unit in p.units),
         values,
         law,

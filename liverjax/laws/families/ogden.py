@@ -45,7 +45,9 @@ class Ogden(Law):
         return sum(m * a for m, a in zip(self.mu, self.alpha, strict=True)) / 2
 
     def check(self):
-        """Raise `InputError` if mu and alpha have different numbers of terms."""
+        """Raise `InputError` if mu and alpha have no terms, or different numbers of terms."""
+        if len(self.mu) == len(self.alpha) == 0:
+            raise InputError("law ogden has no terms (mu = [], alpha = []): give at least one term")
         if len(self.mu) != len(self.alpha):
             raise InputError(
                 f"law ogden has {len(self.mu)} values of mu and {len(self.alpha)} values of alpha: give one mu and "

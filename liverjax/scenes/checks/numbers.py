@@ -3,10 +3,15 @@
 The mesh is not checked.
 """
 
+import jax
+import numpy as np
+
 from liverjax.core import bounds
+from liverjax.core.errors import InputError
 from liverjax.mesh.shape_functions import basis
 from liverjax.physics import porosity, viscosity
-from liverjax.scenes.checks.regions import check_region_numbers
+from liverjax.scenes.by_element import law_of_elements
+from liverjax.scenes.checks.regions import check_region_elements, check_region_numbers
 from liverjax.scenes.regions import POROUS, laws_of
 from liverjax.scenes.scene import Scene, named_physics
 from liverjax.scenes.springpots import check_springpots
@@ -46,7 +51,8 @@ def check_numbers(scene: Scene) -> None:
     Do not call this function inside jit.
 
     Raises:
-        InputError: a number is out of bounds, or numbers of law, viscosity or porosity contradict each other.
+        InputError: a number is out of bounds, numbers of law, viscosity or porosity contradict each other, the shear
+            modulus at rest is negative in an element, or the elements of a region are wrong.
     """
     check_bounds(scene)
     for law in laws_of(scene.law, scene.region):
@@ -57,3 +63,26 @@ def check_numbers(scene: Scene) -> None:
             check_springpots(scene.springpots, law, scene.viscosity)
     if scene.porosity is not None:
         porosity.check_porosity(scene.porosity)
+    check_region_elements(scene)
+    _check_stiffness(scene)
+
+
+def _check_stiffness(scene: Scene) -> None:
+    """Raise InputError if the shear modulus at rest of the whole law is negative in an element.
+
+    One law of a sum may have a negative shear modulus. A law without the method `shear_modulus` is not checked, and
+    neither is a law inside jit, grad or vmap.
+    """
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((scene.law, scene.region))):
+        return
+    whole = law_of_elements(scene.law, scene.region, scene.mesh.number_of_elements)
+    for k in range(len(whole.pieces())):
+        try:
+            moduli = np.asarray(whole.piece(k).shear_modulus(), float)
+        except InputError:  # a law may have no moduli
+            continue
+        if np.any(moduli < 0):
+            raise InputError(
+                f"law has a shear modulus of {moduli.min():.4g} Pa at rest, which must not be negative: change its "
+                "parameters or those of its regions, e.g. the sign of a coefficient"
+            )
