@@ -11,6 +11,7 @@ from fitting.fits.honesty.alike_answers import fitted_by_its_noise, with_alike_n
 from fitting.fits.honesty.long_times import INTERVAL
 from fitting.fits.time_tests import INDEPENDENT
 from fitting.methods import time_response, uncertainty
+from fitting.methods.estimate import LEAST_FREEDOM
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers import time_tests as reader
 from fitting.readers.base_line import base_line
@@ -54,6 +55,13 @@ def test_errors_of_shared_noise_are_those_of_many_draws():
     assert np.all((np.median(before, axis=0) < 0.7 * scatter)[1:])
     # The scatter of 16 draws has an error of 18 %; the correlation length of the noise is known only roughly.
     assert np.all(np.median(after, axis=0) > 0.6 * scatter) and np.all(np.median(after, axis=0) < 2.5 * scatter)
+
+
+def test_few_independent_values_have_three_degrees_of_freedom():
+    """The quantile of such a test was 12.7, and that of a sweep 3.2."""
+    noise = 0.01 * _autoregression(np.random.default_rng(0), 40, 0.97)
+    fit = with_alike_noise(time_tests.fit(_relaxation(np.linspace(0.1, 300, 40), noise), modes=2))
+    assert fit.details[INDEPENDENT] < 5 and fit.uncertainty.freedom == LEAST_FREEDOM
 
 
 def test_a_dashpot_leaves_the_other_errors_those_of_correlated_noise():

@@ -1,6 +1,7 @@
 """Tests described by a TOML file: simulated samples, other integrals, cycles; invalid input; the commands."""
 
 import json
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from fitting.commands.together import errors_of_sizes
 from fitting.fits import time_tests as fits
 from fitting.methods.generalised_maxwell import Maxwell, moduli
 from fitting.readers.time_tests import Sample, TimeTest, read_time_test
-from fitting.rigs import described, glued, thin_layer
+from fitting.rigs import compression, described, glued, thin_layer
 from fitting.rigs.described import curve_of, read_described
 
 pytestmark = pytest.mark.quick_to_compile
@@ -249,6 +250,44 @@ def test_a_glued_sample_is_also_simulated_against_the_load(tmp_path, monkeypatch
     exact = force(d / 0.01 if test == "tension" else -d / 0.01)
     strain = np.interp(time, found.time, found.driven)
     np.testing.assert_allclose(strain / strain[9], exact / exact[9], atol=5e-3)
+
+
+def test_a_simulation_against_the_load_that_fails_is_told(monkeypatch):
+    """Such a test was refused, although the test in the direction of the load was computed."""
+
+    def secants(test, end, path):
+        if end < 0:
+            raise lj.InputError("the simulation of an elastic sample fails: give smaller displacements")
+        return end * np.array([0.05, 1.0]), np.array([2.0, 3.0]), []
+
+    monkeypatch.setattr(described, "_secants", secants)
+    own = described.Described("tension", Path("a.csv"), {"radius": 0.01, "height": 0.01}, 0.4995, "force", 0.0, False)
+    curve, _, notes = described._glued_curve(own, (1e-3, 5e-4), "a.toml")
+    assert curve(1e-3) == pytest.approx(3e-3) and curve(-5e-4) == pytest.approx(-1e-3)
+    assert any("the force is assumed to be linear there, because the simulation" in note for note in notes)
+
+
+def test_a_wide_glued_punch_has_an_error_of_its_size():
+    """A punch wider than 8 heights was refused because of this approximate error."""
+    of = []
+    for punch in (0.0159, 0.0161, 0.019):
+        sizes = {"radius": 0.02, "height": 0.002, "punch": punch}
+        own = described.Described("glued_punch", Path("a.csv"), sizes, 0.4995, "displacement", 0.0, False)
+        by_height, by_radius = described._change_per_size(own, 1e-4)
+        of.append((by_height * 0.002, by_radius * punch))
+    np.testing.assert_allclose(of[1:], [of[0], of[0]], rtol=0.02)
+    assert 2 < of[0][0] < 3 < of[0][1] < 4
+
+
+@pytest.mark.parametrize("poisson", [0.0, 0.1])
+def test_a_slender_sample_of_low_poisson_s_ratio_is_compressed(poisson):
+    """A compression by 40 % ended in a ValueError of SciPy."""
+    law = described._neo_hookean(poisson)
+    for strain in (0.1, 0.4, 0.5):
+        a = compression.side_stretch(law, strain)
+        assert abs(compression._cauchy(law, a, 1 - strain)[0]) < 1e-6
+    with pytest.raises(lj.InputError, match=r"not found at a compression by 0[.]7: give a smaller"):
+        compression.side_stretch(law, 0.7)
 
 
 def test_cycles_between_plates_give_the_numbers_back(tmp_path):

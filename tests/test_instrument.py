@@ -357,6 +357,19 @@ def test_an_error_that_cannot_be_checked_is_in_the_standard_errors(off):
     assert [n.name for n in known] == ["inertia"] and np.all(values == 0)
 
 
+@pytest.mark.parametrize(("inertia", "friction"), [(0.01, 1.0), (-0.02, 3.0), (0.06, -1.0)])
+def test_two_errors_of_exact_data_are_in_the_standard_errors(inertia, friction):
+    """Their covariance is singular except for rounding, and its Cholesky decomposition ended in LinAlgError."""
+    omega = np.geomspace(5, 15, 10)
+    storage, loss = generalised_maxwell.moduli(Maxwell(np.float64(1600.0), np.array([0.375]), np.array([0.1])), omega)
+    share, rubbing = 8000 * (omega / 15) ** 2, 10 * omega / 15
+    s = Sweep(omega, storage - inertia * share, loss + friction * rubbing, inertia=share)
+    s = s._replace(friction=rubbing, friction_error=2e-7)
+    fit, _ = instrument.without_error_of_inertia(viscoelastic.closed_form(s, 1), s)
+    assert fit.details["instrument"]["could_not_be_checked"]
+    assert abs(fit.uncertainty.values[0] - 1600) < 1.5 * fit.uncertainty.standard_errors[0] < 400
+
+
 def test_without_raw_columns_nothing_happens():
     s = sweep(5e-4, 0)._replace(inertia=None)
     fit = viscoelastic.closed_form(s, 2)

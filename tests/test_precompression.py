@@ -359,6 +359,16 @@ def test_the_inertia_of_a_compressed_sample_is_that_of_its_mass(tmp_path, law):
     assert content["mean_relative_error"] < 1e-6
 
 
+def test_the_density_of_a_closed_form_is_that_of_its_waves(tmp_path):
+    """The waves of the closed form had the density of water, although --density gave another one."""
+    hertz = np.geomspace(0.02, 2, 12)
+    path = sweep_file(tmp_path, generalised_maxwell.moduli(REST, 2 * np.pi * hertz), hertz)
+    ask = [str(path), "--method", "closed-form", "--density", "2000", "--height", "0.002", "--modes", "2"]
+    assert command.main([*ask, "--out", str(tmp_path)]) == 0
+    content = json.loads((tmp_path / "fit.json").read_text())
+    assert content["details"]["density_kg_m3"] == content["shear_waves"]["density_kg_m3"] == 2000
+
+
 @pytest.mark.slow
 def test_a_tall_compressed_sample_with_inertia_goes_through_the_simulation(tmp_path):
     """The simulated inertia was divided by the stiffness of the mesh. G0 was 3 % too low, and the message named the

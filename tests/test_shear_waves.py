@@ -12,6 +12,9 @@ from fitting.commands import sweep as sweep_command
 from fitting.commands import together as together_command
 from fitting.fits.honesty import common_factor
 from fitting.fits.together import common_fit, doubts, measured_tests
+from fitting.fits.together.measured_tests import ResolvedBand, resolved_by
+from fitting.fits.together.residuals_of_tests import criterion_of_all
+from fitting.fits.viscoelastic import FLUID, Kind
 from fitting.methods import generalised_maxwell
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.frequency_sweep import Sweep
@@ -102,6 +105,25 @@ def test_a_better_fit_whose_parameters_are_not_determined_is_told(tmp_path, caps
     assert found.modes == 1 and found.model.shear_modulus < 4000
     (told,) = (w for w in found.warnings if w.startswith("2 modes follow the tests better than 1"))
     assert "The stated errors do not contain this difference" in told
+
+
+def test_a_determined_solid_beside_a_fluid_is_told():
+    """A warning said that the tests do not determine the parameters of this solid."""
+    tests = [sweep(0.01), waves(0.01)]
+    band = ResolvedBand(resolved_by(tests))
+    solid, fluid = (common_fit._one_test(tests, band, n, kind) for n, kind in ((2, Kind()), (1, FLUID)))
+    points = sum(s.points for s in fluid.shares)
+    factor = np.exp((criterion_of_all(solid) - 5 - criterion_of_all(fluid)) / (2 * points))
+    fluid = fluid._replace(shares=[s._replace(noise=s.noise * factor) for s in fluid.shares])
+    assert common_fit._able(solid, band) and criterion_of_all(fluid) == pytest.approx(criterion_of_all(solid) - 5)
+    told = common_fit._told_of_all(solid, [solid, fluid], band).warnings
+    assert any("prony_fluid explains the data about as well as prony (criterion 5 lower" in w for w in told)
+    told = common_fit._told_of_all(fluid, [solid, fluid._replace(converged=False)], band).warnings
+    assert not any("about as well" in w for w in told)  # the solid is not better
+    fluid = fluid._replace(shares=[s._replace(noise=s.noise * np.exp(5 / points)) for s in fluid.shares])
+    told = common_fit._told_of_all(fluid, [solid, fluid], band).warnings
+    assert any("prony explains the data about as well as prony_fluid (criterion 5 lower" in w for w in told)
+    assert not any("do not determine all of their parameters" in w for w in told)
 
 
 def test_a_file_of_waves_alone_names_the_option(tmp_path):

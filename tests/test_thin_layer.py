@@ -25,6 +25,12 @@ def test_on_a_thick_layer_the_force_is_that_on_a_half_space():
         assert np.allclose(Layer(thick(shape)).force(np.array([-d, 0.0, d])), [0, 0, force / plane], rtol=3e-6)
 
 
+def test_poisson_s_ratio_may_be_an_array():
+    """An array without dimensions ended in a TypeError."""
+    found = [Layer(Indenter("sphere", 1e-3, nu, 1e-3)).force(np.array([1e-5]))[0] for nu in (0.5, np.array(0.5))]
+    assert found[0] == found[1]
+
+
 def test_the_first_term_is_the_printed_one():
     """Dimitriadis et al. 2002, equation 12, has 1.133, from an integral that they fitted to a percent."""
     chi = 1e-6

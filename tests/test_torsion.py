@@ -258,6 +258,11 @@ def test_the_inertia_of_a_sample_in_tension_is_that_of_young_s_modulus(tmp_path)
     np.testing.assert_allclose(back.storage, seen.real / 3, rtol=1e-9)
     # The simulation has the inertia of torsion, so it is run without inertia.
     assert simulated_rheometer.Simulation(density=1060.0, tensile=True).run.density is None
+    simulated, run = simulated_rheometer._as_simulated(
+        sweeps["E"], simulated_rheometer.Simulation(0.01, 0.02, density=1060.0)
+    )
+    assert run.density is None
+    np.testing.assert_allclose(simulated.storage, own.storage, rtol=1e-9)
     for wrong, words in (
         (lambda s: sample_inertia.taken_off(s, 1060.0, 0.02), "of bending, where .* remove --density"),
         (lambda s: with_friction(s, 1e-7, 0.01, 0.02), "of bending, and --friction-error 1e-07 .* remove"),

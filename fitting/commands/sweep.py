@@ -415,6 +415,7 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
         closed = instrument.with_gap_error(closed, options.gap_error / simulation.height)
     fits = [edges.honest(closed, corrected, dense)]
     heavy = {} if options.density is None else {"density_kg_m3": options.density}
+    fits[0].details.update(heavy)
     if options.method != "closed-form":
         fits.append(_simulated(options, corrected, fits[0], simulation.run))
         fits[1].details.update(heavy)

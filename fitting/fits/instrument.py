@@ -149,7 +149,7 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep, factors: compression.Shares
         details = fit.details | {"instrument": instrument_numbers(errors, known)}
         warnings, seconds = (*fit.warnings, *_not_corrected(errors, known)), fit.run_time + time.perf_counter() - begin
         if errors.unchecked:
-            whole = errors.covariance + np.outer(errors.values, errors.values)
+            whole = np.column_stack([_root_of(errors.covariance), errors.values])
             fit = fit._replace(uncertainty=_with_directions(fit, sweep, known, whole))
         return fit._replace(details=details, warnings=warnings, run_time=seconds), sweep
     corrected = _shifted(weighed, known, best.values)
@@ -158,7 +158,7 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep, factors: compression.Shares
     refitted = best.fit._replace(details=details, compile_time=fit.compile_time)
     if viscoelastic.TRIED in details:
         refitted = _beside_more_modes(fit, refitted, tried, weighed)
-    spread = _with_directions(refitted, corrected, known, best.covariance)
+    spread = _with_directions(refitted, corrected, known, _root_of(best.covariance))
     refitted = models.compared_again(
         refitted._replace(uncertainty=spread),
         corrected,
@@ -402,15 +402,23 @@ def _halved_until_positive(sweep: Sweep, known: list[Nuisance], values: np.ndarr
     return np.zeros_like(step)
 
 
-def _with_directions(fit: Fit, sweep: Sweep, known: list[Nuisance], covariance: np.ndarray) -> Estimate:
-    """Return the estimate of the modes with standard errors that also contain the errors of the instrument."""
+def _root_of(covariance: np.ndarray) -> np.ndarray:
+    """Return a square root A (k, k) of the covariance A A^T. Rounding can make an eigenvalue slightly negative; it then
+    counts as 0."""
+    sizes, vectors = np.linalg.eigh(covariance)
+    return vectors * np.sqrt(np.maximum(sizes, 0.0))
+
+
+def _with_directions(fit: Fit, sweep: Sweep, known: list[Nuisance], root: np.ndarray) -> Estimate:
+    """Return the estimate of the modes with standard errors that also contain the k errors of the instrument. `root`
+    (k, c): square root of the covariance of these errors, with c columns."""
     J = np.asarray(fit.solution.jacobian)
     _, slope = host.with_jacobian(
         lambda u: uncertainty.parameter_vector(u, fit.kind.maxwell), np.asarray(fit.solution.u)
     )
     moved = slope @ np.linalg.lstsq(J, directions(sweep, known), rcond=1e-12)[0]
     estimate = fit.uncertainty
-    for direction in (moved @ np.linalg.cholesky(covariance)).T:
+    for direction in (moved @ root).T:
         estimate = wider(estimate, direction)
     return estimate
 

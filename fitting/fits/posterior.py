@@ -46,7 +46,8 @@ PRIORS = {
     "log-uniform from a tenth of the shortest to ten times the longest time that the data resolve; the ratios and "
     "the equilibrium fraction are uniform on the simplex (all values that add up to 1)",
     "fractional": "moduli at the middle of the band are log-uniform within a factor of 1000 of the measured moduli; "
-    "exponents are uniform between 0 and 1; of two exponents, all pairs in the order of the model are equally probable",
+    "exponents are uniform between 0 and 1; if there are two exponents, every pair with the first at least as large as "
+    "the second is equally probable",
 }
 #: Words of `PRIORS` -> words for a relaxation or creep test. Its prior is relative to the fitted G0 (`of_time_test`).
 _OF_TIME_TESTS = {

@@ -240,6 +240,14 @@ KEPT = (
 )
 
 
+def _as_simulated(sweep: Sweep, simulation: Simulation) -> tuple[Sweep, Simulation]:
+    """Return the sweep and the settings with which it is simulated. The inertia in data of tension is not that of
+    torsion. So this inertia is subtracted from the data, and the simulation has none."""
+    if simulation.inertia is None or not sweep.tensile:
+        return sweep, simulation
+    return sample_inertia.taken_off(sweep, *simulation.inertia), simulation._replace(tensile=True).run
+
+
 def through_torsion(
     sweep: Sweep,
     start: Fit,
@@ -250,14 +258,15 @@ def through_torsion(
     """Fit the moduli that the simulated rheometer measures to the data. The search begins at the closed-form fit.
 
     Args:
-        sweep: data.
+        sweep: data. They contain the inertia of the sample if `simulation` has a density.
         start: closed-form fit with the wanted number of modes, and with the errors of gap and instrument.
-        simulation: settings of the simulated test.
+        simulation: settings of the simulated test. For data of tension, the fitted moduli contain no inertia.
         optimizer: one of `OPTIMIZERS`.
         progress: called after every evaluation.
     """
     check_optimizer(optimizer)
     begin = time.perf_counter()
+    sweep, simulation = _as_simulated(sweep, simulation)
     data = simulation_data(sweep, simulation)
     # Nearly all of the time for the compression is compilation.
     pressing = time.perf_counter() - begin if simulation.precompression else 0.0

@@ -368,7 +368,9 @@ def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
     if lowest < criterion(chosen) - 10 and closer.modes != chosen.modes:
         errors = [float(f.relative_errors.mean()) for f in (closer, chosen)]
         out.append(viscoelastic.closer_but_not_chosen(closer.modes, errors, closer.converged))
-    out += [] if elastic else [*uncertainty.superfluous(test, chosen.uncertainty), *_rival_kind(chosen, tried, test)]
+    if not elastic:
+        out += uncertainty.superfluous(test, chosen.uncertainty)
+        out += choice.rival_kind(chosen, [f for f in tried if identifiable(f, test)], criterion)
     low, high = test.resolved
     for k, tau in enumerate(chosen.model.relaxation_times):
         if not elastic and not low <= tau <= high:
@@ -380,17 +382,6 @@ def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
     details |= {ELASTIC: elastic} if elastic else {}
     seconds = {n: sum(getattr(f, n) for f in tried) for n in ("run_time", "compile_time")}
     return chosen._replace(warnings=tuple(out), details=details, **seconds)
-
-
-def _rival_kind(chosen: TimeFit, tried: list[TimeFit], test: TimeTest) -> list[str]:
-    """Return a warning if a solid is chosen and a fluid explains the test about as well, or if a fluid is chosen and a
-    solid explains the test better."""
-    others = [f for f in tried if f.kind.name != chosen.kind.name and identifiable(f, test)]
-    if not others:
-        return []
-    other = min(others, key=criterion)
-    apart, limit = criterion(other) - criterion(chosen), 0.0 if chosen.kind.name == FLUID.name else choice.STRONG
-    return [choice.undecided(other.kind.name, chosen.kind.name, apart)] if apart < limit else []
 
 
 #: Key in `TimeFit.details`: modulus [Pa], with standard error, of an elastic material that explains the test equally

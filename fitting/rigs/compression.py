@@ -32,6 +32,9 @@ from liverjax.laws import Law
 LARGEST = 0.5
 #: Maximum strain of one load step.
 _STEP = 0.05
+#: Lower ends of the search for the radial stretch, divided by 1 or by the stretch at constant volume. The second end is
+#: used if the first is too high, which happens if Poisson's ratio is small.
+_LOWER_ENDS = (0.9, 0.5)
 
 
 class Shares(NamedTuple):
@@ -93,11 +96,23 @@ def incompressible(law: Law, strain: float) -> Shares | None:
 
 def side_stretch(law: Law, strain: float) -> float:
     """Return the radial stretch of a cylinder that is compressed by `strain` between frictionless plates. A negative
-    strain is a tension."""
+    strain is a tension.
+
+    Raises:
+        InputError: the law is not isotropic, or no radial stretch makes the side free of stress.
+    """
     _refuse_directions(law)
     axial = 1 - strain
-    ends = 0.9 * min(1.0, axial**-0.5), 1.1 * max(1.0, axial**-0.5)
-    return float(brentq(lambda a: _cauchy(law, a, axial)[0], *ends, xtol=1e-14))
+    for low in _LOWER_ENDS:
+        ends = low * min(1.0, axial**-0.5), 1.1 * max(1.0, axial**-0.5)
+        try:
+            return float(brentq(lambda a: _cauchy(law, a, axial)[0], *ends, xtol=1e-14))
+        except ValueError:  # the stress has the same sign at both ends
+            continue
+    raise InputError(
+        f"the radial stretch of a sample with law {type(law).__name__} is not found at a compression by {strain:g}: "
+        "give a smaller compression, or a larger Poisson's ratio"
+    )
 
 
 def torsional_density(law: Law, strain: float, density: float) -> float:

@@ -303,7 +303,8 @@ def _change_per_size(described: Described, largest: float) -> tuple[float, float
     glued punch, this is the radius of the punch. The half angle of a cone is assumed to be exact.
 
     These numbers are only for errors, so approximations are enough for glued samples. The stiffness of a glued cylinder
-    is that of Gent and Lindley (1959, Proc. Inst. Mech. Eng. 173:111). A glued punch is a punch on a wide layer.
+    is that of Gent and Lindley (1959, Proc. Inst. Mech. Eng. 173:111). A glued punch is a punch on a wide layer. If its
+    radius is more than `thin_layer.WIDEST` heights, the numbers are those of a punch with this ratio.
     """
     sizes, test = described.sizes, described.test
     height, radius = sizes.get("thickness", sizes.get("height", 0.0)), sizes.get("punch", sizes.get("radius", 0.0))
@@ -316,12 +317,9 @@ def _change_per_size(described: Described, largest: float) -> tuple[float, float
         layer = thin_layer.Layer(thin_layer.Indenter(shape, height, described.poisson, radius, angle))
         return float(layer.force(np.array([largest]))[0])
 
-    # A thicker layer and a smaller indenter stay within the table of forces.
-    own, thicker, smaller = (
-        force(height, radius),
-        force((1 + _STEP) * height, radius),
-        force(height, (1 - _STEP) * radius),
-    )
+    # A thicker layer and a smaller indenter stay within the table of forces. Only the ratio of the sizes matters.
+    used = max(height, radius / thin_layer.WIDEST) if test == "glued_punch" else height
+    own, thicker, smaller = force(used, radius), force((1 + _STEP) * used, radius), force(used, (1 - _STEP) * radius)
     by_radius = (1 - smaller / own) / (_STEP * radius) if radius else 0.0
     return (1 - thicker / own) / (_STEP * height), by_radius
 
@@ -352,7 +350,10 @@ def _glued_curve(
             "the fit assumes that this force relaxes like the shear stress (quasi-linear)"
         )
     if back > _REVERSED * height:
-        other, reverse, told = secants(described, -back, path)
+        try:
+            other, reverse, told = secants(described, -back, path)
+        except InputError as error:  # `np.interp` below then returns the first secant there
+            other, reverse, told = at[:0], secant[:0], [f"the force is assumed to be linear there, because {error}"]
         at, secant = np.concatenate([other[::-1], at]), np.concatenate([reverse[::-1], secant])
         notes += [f"for displacements against the direction of the load: {note}" for note in told if note not in notes]
     return (lambda d: d * float(np.interp(d, at, secant))), height, notes

@@ -140,7 +140,7 @@ class Layer:
         if rig.shape == "punch":
             self._punch, self.deepest = punch_factor(rig.radius, rig.thickness, rig.poisson), np.inf
             return
-        table = factors(rig.poisson, rig.shape)
+        table = factors(float(rig.poisson), rig.shape)  # arrays cannot be keys of the cache
         self._factor = scipy.interpolate.CubicSpline(table.reach, table.factor)
         unit = reach(rig, np.ones(1))[0]
         #: Largest depth [m] in the table.

@@ -5,8 +5,8 @@ the data at least as closely. It is chosen only if the criterion is strong evide
 Am. Stat. Assoc. 90). If the data do not need the general model, its predictions outside the measured band are worse.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol, TypeVar
 
 from fitting.fits.viscoelastic import FLUID, Kind
 
@@ -80,6 +80,26 @@ class OfAKind(Protocol):
         """Number of Prony modes."""
 
 
+AnyFit = TypeVar("AnyFit", bound=OfAKind)
+
+
 def label_of(fit: OfAKind) -> Label:
     """Return the name of the fitted model, and its number of modes (0 if the model does not consist of Prony modes)."""
     return Label(fit.kind.name, fit.modes if fit.kind.values is None else 0)
+
+
+def rival_kind(chosen: AnyFit, determined: Sequence[AnyFit], criterion: Callable[[AnyFit], float]) -> list[str]:
+    """Return a warning if a solid is chosen and a fluid explains the data about as well, or if a fluid is chosen and a
+    solid explains the data better.
+
+    Args:
+        chosen: the chosen fit.
+        determined: fits whose parameters the data determine.
+        criterion: function that returns the information criterion of a fit.
+    """
+    others = [fit for fit in determined if fit.kind.name != chosen.kind.name]
+    if not others:
+        return []
+    other = min(others, key=criterion)
+    apart, limit = criterion(other) - criterion(chosen), 0.0 if chosen.kind.name == FLUID.name else STRONG
+    return [undecided(other.kind.name, chosen.kind.name, apart)] if apart < limit else []

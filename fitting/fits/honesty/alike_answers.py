@@ -12,7 +12,7 @@ from fitting.fits.time_tests import INDEPENDENT, TimeFit
 from fitting.fits.together.measured_tests import Measured, reported_numbers
 from fitting.fits.together.residuals_of_tests import Together
 from fitting.methods import host, uncertainty
-from fitting.methods.estimate import Estimate, errors_and_correlation
+from fitting.methods.estimate import Estimate, errors_and_correlation, freedom_of_alike
 from fitting.methods.noise.alike_noise import alike_noise
 from fitting.methods.noise.uneven_noise import probability_of_sizes, uneven_root
 from fitting.readers.time_tests import TimeTest
@@ -154,8 +154,9 @@ def _of_such_noise(
     root = host.with_jacobian(natural_of, u)[1] @ root
     errors, correlation = errors_and_correlation(root)
     errors = np.where(np.isfinite(estimate.standard_errors), errors, np.inf)
-    taken = estimate.components - estimate.freedom
-    freedom = estimate.freedom if independent is None else max(1.0, independent - taken)
+    freedom = estimate.freedom
+    if independent is not None:
+        freedom = freedom_of_alike(freedom, estimate.components, independent)
     return estimate._replace(root=root, standard_errors=errors, correlation=correlation, freedom=freedom)
 
 

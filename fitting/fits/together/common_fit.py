@@ -149,7 +149,8 @@ def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) ->
     out += missed(chosen.shares)
     out += structured(chosen)
     out += uncertainty.superfluous(band, chosen.uncertainty)
-    out += of_better_fits(chosen, tried)
+    out += of_better_fits(chosen, [f for f in tried if not _able(f, band)])
+    out += choice.rival_kind(chosen, [f for f in tried if _able(f, band)], criterion_of_all)
     out += of_rises(chosen)
     if chosen.kind.name == "prony":
         out += uncertainty.like_a_fluid(chosen.uncertainty, "measure longer, or at lower frequencies")

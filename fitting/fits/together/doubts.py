@@ -47,10 +47,10 @@ def missed(shares: list[Share]) -> list[str]:
     ]
 
 
-def of_better_fits(chosen: Together, tried: list[Together]) -> list[str]:
+def of_better_fits(chosen: Together, undetermined: list[Together]) -> list[str]:
     """Return a warning if a fit with more modes follows the tests clearly better, although the tests do not determine
-    all of its parameters."""
-    best = min(tried, key=criterion_of_all)
+    all of its parameters. `undetermined`: all fits with such parameters."""
+    best = min(undetermined, key=criterion_of_all, default=chosen)
     lower = criterion_of_all(chosen) - criterion_of_all(best)
     if best.modes <= chosen.modes or not lower > BETTER:
         return []
