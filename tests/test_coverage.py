@@ -1,9 +1,15 @@
-"""The study of coverage fits thousands of sweeps at once. Its fits and intervals are those of the program."""
+"""The study of coverage fits thousands of sweeps at once. Its fits and intervals are those of the program. The study of
+a posterior runs the liver with the moduli of the fit.
+"""
+
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from experiments.identification import coverage
+import liverjax as lj
+from experiments.identification import coverage, propagate_posterior
+from experiments.liver import models
 from fitting.fits import viscoelastic
 from fitting.methods import generalised_maxwell, springpots, uncertainty
 from fitting.readers.frequency_sweep import Sweep
@@ -38,3 +44,22 @@ def test_truths_without_disturbance_are_measured_as_they_are():
     G = TRUTH.moduli(coverage.OMEGA)
     apart = DATA / np.concatenate([G.real, G.imag], axis=1) - 1
     assert apart.std() == pytest.approx(coverage.NOISE, rel=0.15)  # of 372 numbers: known to 4 %
+
+
+def test_the_liver_of_the_posterior_has_the_fitted_modulus(monkeypatch):
+    """Its ground-state shear modulus was 0.8 % above the fitted G0."""
+    scene = models()["viscous"]
+    points = scene.mesh.points
+
+    def mu_as_motion(_, values):
+        """Return runs whose points move by mu."""
+        moved = points[None, None] + values["law.mu"][:, None, None, None] * np.array([[[[1.0, 0.0, 0.0]]]])
+        return SimpleNamespace(result=SimpleNamespace(positions=moved, status=np.zeros((len(moved), 1), int)))
+
+    rest = SimpleNamespace(check=lambda: SimpleNamespace(positions=points[None]))
+    monkeypatch.setattr(propagate_posterior.lj, "simulate", lambda _: rest)
+    monkeypatch.setattr(propagate_posterior.lj, "simulate_batch", mu_as_motion)
+    run, _, _ = propagate_posterior.liver()
+    mu = float(run(np.array([[771.5, 0.2, 0.3, 0.3, 0.03]]))[0, 0])
+    law = lj.with_parameters(scene, {"law.mu": mu}).law
+    assert float(law.shear_modulus()) == pytest.approx(771.5, rel=1e-9)

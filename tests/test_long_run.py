@@ -273,6 +273,66 @@ def test_parts_that_a_killed_sweep_left_are_removed(tmp_path):
             resumable_parts.remove(folder)
 
 
+def _finished(table: sweep.Sweep, out: Path) -> None:
+    """Write the parts of a sweep, as if all rows were computed."""
+    folder = resumable_parts.beside(out)
+    resumable_parts.make_folder(folder)
+    resumable_parts.same(table.identity, folder / "sweep.json")
+    for k in sweep._chunks(table):
+        n = len(sweep._of(table, k))
+        results = {"status": np.zeros((n, 2), int), "volume_ratios": np.ones((n, 2))}
+        resumable_parts.write(resumable_parts.part(folder, k), results)
+
+
+def _swept(folder: Path, outputs: tuple[str, ...] = ("final_positions",), chunk: int = 16) -> sweep.Sweep:
+    (folder / "scene.toml").write_text(LONG)
+    (folder / "rows.csv").write_text("law.mu\n700\n710\n")
+    return sweep.read_sweep(folder / "scene.toml", folder / "rows.csv", outputs, chunk=chunk)
+
+
+def test_the_results_of_a_wide_table_are_joined(tmp_path):
+    """The names of the columns were too large for an attribute, after all runs were computed."""
+    table, out = _swept(tmp_path), tmp_path / "rows.h5"
+    names = tuple(f"law.mu.{k}" for k in range(4200))
+    _finished(table, out)
+    assert sweep.run(table._replace(names=names, rows=np.ones((2, 4200))), out, resume=True).file == out
+    with h5py.File(out) as file:
+        assert tuple(file["names"].asstr()[:]) == names and "names" not in file["parameters"].attrs
+
+
+def test_a_finished_sweep_is_known_again(tmp_path):
+    """Other chunks, another order of the outputs or another version of NumPy were called another sweep."""
+    table, out = _swept(tmp_path, ("final_positions", "positions")), tmp_path / "rows.h5"
+    _finished(table, out)
+    assert sweep.run(table, out, resume=True).file == out
+    again = _swept(tmp_path, ("positions", "final_positions"), chunk=1)
+    again.identity["versions"] = {"numpy": "0"}
+    assert sweep.run(again, out, resume=True) == sweep.Done(out, {}, 0, {})
+    with pytest.raises(lj.InputError, match=r"another sweep \(not the same outputs\)"):
+        sweep.run(_swept(tmp_path), out, resume=True)
+    with pytest.raises(lj.InputError, match=r"another sweep \(not the same numbers, parameters\)"):
+        changed = table.identity | {"numbers": "0", "parameters": "0"}
+        sweep.run(table._replace(identity=changed), out, resume=True)
+
+
+def test_a_process_that_comes_after_the_join_ends_well(tmp_path, monkeypatch):
+    """It ended with an error. If the parts were removed just before it joined them, it said that rows were left."""
+    table, out = _swept(tmp_path), tmp_path / "rows.h5"
+    _finished(table, out)
+    join = sweep._joined
+
+    def joined_before(*given):
+        assert join(*given).file == out and not resumable_parts.beside(out).exists()
+        return join(*given)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(sweep, "_joined", joined_before)
+        assert sweep.run(table, out, process=(0, 2)) == sweep.Done(out, {}, 0, {})
+    assert sweep.run(table, out, process=(1, 2)) == sweep.Done(out, {}, 0, {})
+    with pytest.raises(lj.InputError, match="exists already"):
+        sweep.run(table, out)
+
+
 def test_a_kill_while_parts_are_removed_leaves_no_parts_of_unknown_input(tmp_path, monkeypatch):
     """The file with the input went first, and --resume put the remaining parts into the run of another scene."""
     folder = tmp_path / "result.h5.parts"

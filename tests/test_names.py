@@ -66,12 +66,28 @@ def test_a_write_that_fails_leaves_the_file_as_it_was(tmp_path):
     assert file.read_text() == "first" and list(tmp_path.iterdir()) == [file]
 
 
-def test_two_processes_write_one_file(tmp_path, monkeypatch):
-    """Both used one temporary name: the second process failed, and removed the file of the first one."""
+def test_two_processes_of_one_number_write_one_file(tmp_path):
+    """Processes of two containers may have one number. Both used one temporary name: the second process failed, and
+    removed the file of the first one.
+    """
     file = tmp_path / "result.h5"
     with whole(file) as first:
         first.write_text("first")
-        monkeypatch.setattr(os, "getpid", lambda: 0)
         with pytest.raises(OSError), whole(file):
             raise OSError
     assert file.read_text() == "first" and list(tmp_path.iterdir()) == [file]
+
+
+def test_temporary_files_of_killed_processes_are_removed(tmp_path):
+    file = tmp_path / "result.h5"
+    with whole(file) as new:
+        left = new.with_name(new.name.replace("result.", "result.0"))
+        left.write_text("half")
+        new.write_text("first")
+    with whole(file) as new:
+        new.write_text("second")
+    assert left.exists()  # its process may still write
+    os.utime(left, (0, 0))
+    with whole(file) as new:
+        new.write_text("third")
+    assert list(tmp_path.iterdir()) == [file]

@@ -28,7 +28,6 @@ SWEEP = "data/porcine_liver_frequency_sweep.csv"
 NOISE, SEED, DRAWS, SOBOL, SECONDS, DT, LANES = 0.05, 3, either(256, 16), either(64, 4), 1.0, 0.05, either(32, 4)
 NAMES = ("G0", "g1", "g2", "tau1", "tau2")
 LABELS = {"G0": "$G_0$", "g1": "$g_1$", "g2": "$g_2$", "tau1": r"$\tau_1$", "tau2": r"$\tau_2$"}
-GROUND_STATE = 770.0 / 715.0  # ground-state shear modulus of the scene's Arruda-Boyce law, divided by its parameter mu
 
 
 def posterior() -> tuple[np.ndarray, np.ndarray]:
@@ -54,12 +53,13 @@ def liver() -> tuple[Callable[[np.ndarray], np.ndarray], int, np.ndarray]:
     times.
     """
     scene = with_solve(models()["viscous"], SECONDS, DT)
+    stiffer = float(scene.law.shear_modulus() / scene.law.mu)  # ground-state shear modulus G0, divided by mu
     tip = int(np.argmax(np.linalg.norm(lj.simulate(scene).check().positions[-1] - scene.mesh.points, axis=1)))
 
     @jax.jit
     def program(rows):
         values = {
-            "law.mu": rows[:, 0] / GROUND_STATE,
+            "law.mu": rows[:, 0] / stiffer,
             "viscosity.ratios": rows[:, 1:3],
             "viscosity.relaxation_times": rows[:, 3:5],
         }

@@ -5,12 +5,12 @@ A progress file contains marks (digests) of its problem, so that a run continues
 
 import glob
 import hashlib
-import os
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from uuid import uuid4
 
 import numpy as np
 
@@ -45,10 +45,10 @@ def whole(file: Path) -> Iterator[Path]:
     """Yield a temporary path next to `file`. At the end of the context, the temporary file is renamed to `file`.
 
     If the process is killed or an error occurs, `file` does not change. After an error the temporary file is removed.
-    The temporary name contains the number of the process, so that several processes can write `file`. Temporary files
-    of killed processes are removed if they are older than `OLD`.
+    The temporary name is random, so that several processes on several machines can write `file`. Temporary files of
+    killed processes are removed if they are older than `OLD`.
     """
-    beside = file.with_suffix(f".{os.getpid()}.part")
+    beside = file.with_suffix(f".{uuid4().hex}.part")
     for left in file.parent.glob(f"{glob.escape(file.stem)}.*.part"):
         with suppress(OSError):  # another process may remove it too
             if left.stat().st_mtime < time.time() - OLD:

@@ -53,6 +53,8 @@ OUTPUTS: dict[str, Callable] = {
     "largest_pressure": lambda result, reference: jnp.max(result.pressure),
 }
 _UNITS = {"final_reactions": "N", "largest_pressure": "Pa", "status": "1", "residual": "1", "volume_ratios": "1"}
+#: Maximum number of names in an attribute. HDF5 allows 64 kB for an attribute, and each name takes 16 bytes.
+_MOST_NAMES = 4000
 
 
 class Sweep(NamedTuple):
@@ -218,12 +220,13 @@ def run(
         report: function that is called after each chunk with the number of runs in it.
 
     Raises:
-        InputError: the results exist already, belong to another sweep, or are in use by another process.
+        InputError: the results exist already (with one process, and without `resume`), belong to another sweep, or are
+            in use by another process.
         OSError: the disk is full; finished chunks are kept.
     """
     folder = resumable_parts.beside(out)
     if out.exists():
-        done = _already(sweep, out, resume)
+        done = _already(sweep, out, resume or process[1] > 1)
         _remove_left(sweep, folder)
         return done
     if folder.exists() and not resume and process[1] == 1:
@@ -290,14 +293,25 @@ def _already(sweep: Sweep, out: Path, resume: bool) -> Done:
         raise InputError(f"{out} exists already: give another --out, or remove this file")
     try:
         with h5py.File(out) as file:
-            if json.loads(file.attrs["sweep"]) != json.loads(json.dumps(sweep.identity)):
-                raise InputError(f"{out} belongs to another sweep: give another --out, or remove this file")
+            other = _differing(sweep, dict(json.loads(file.attrs["sweep"])))
+            if other:
+                raise InputError(
+                    f"{out} belongs to another sweep (not the same {', '.join(other)}): give another --out, or remove "
+                    "this file"
+                )
             codes, J = file["status"][:], file["volume_ratios"][:]
     except InputError:
         raise
     except (OSError, KeyError, ValueError, TypeError):
         raise InputError(f"{out} is not the result of a sweep: give another --out, or remove this file") from None
     return Done(out, _failures(sweep, codes), 0, _crushed(sweep, codes, J))
+
+
+def _differing(sweep: Sweep, stored: dict) -> list[str]:
+    """Return the input that differs from that of finished results. Chunks, versions and order of outputs may differ."""
+    own = json.loads(json.dumps(sweep.identity))
+    other = [key for key in ("scene", "numbers", "parameters", "rows") if stored[key] != own[key]]
+    return other + ["outputs"] * (set(stored["outputs"]) != set(own["outputs"]))
 
 
 def _remove_left(sweep: Sweep, folder: Path) -> None:
@@ -317,12 +331,13 @@ def _joined(sweep: Sweep, out: Path, folder: Path, computed: int) -> Done:
                 return Done(None, {}, computed, {})
             if not there:
                 codes, J = _join(sweep, out, files)
-    except (InputError, FileNotFoundError):  # another process is joining the parts
-        return Done(None, {}, computed, {})
-    if there:
-        return _already(sweep, out, True)._replace(computed=computed)
-    resumable_parts.remove(folder)
-    return Done(out, _failures(sweep, codes), computed, _crushed(sweep, codes, J))
+    except (InputError, FileNotFoundError):  # another process is joining the parts, or has joined and removed them
+        there = out.exists()
+        if not there:
+            return Done(None, {}, computed, {})
+    done = _already(sweep, out, True) if there else Done(out, _failures(sweep, codes), 0, _crushed(sweep, codes, J))
+    _remove_left(sweep, folder)
+    return done._replace(computed=computed)
 
 
 #: Number of bytes that HDF5 needs in addition to the datasets.
@@ -347,7 +362,10 @@ def _join(sweep: Sweep, out: Path, files: list[Path]) -> tuple[np.ndarray, np.nd
                         joined[name].attrs["unit"] = _UNITS.get(name, "m")
                     joined[name][_of(sweep, k).start : _of(sweep, k).stop] = value[:]
         joined["row"], joined["parameters"] = sweep.numbers, sweep.rows
-        joined["parameters"].attrs["names"] = list(sweep.names)
+        if len(sweep.names) <= _MOST_NAMES:
+            joined["parameters"].attrs["names"] = list(sweep.names)
+        else:
+            joined["names"] = list(sweep.names)
         if sweep.probes:
             joined["probe_nodes"] = np.array(sweep.probes, dtype=int)
         if "reference" not in joined:  # with a loaded mesh every run has a different reference shape
