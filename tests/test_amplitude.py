@@ -139,6 +139,18 @@ def test_the_command_fits_with_the_series_of_a_sweep(tmp_path, capsys):
     assert (out / "fit.png").stat().st_size > 10_000
 
 
+def test_the_model_is_not_replaced_by_the_results(tmp_path, tanned, capsys):
+    """fit.json, the result of the frequency sweep, was overwritten."""
+    law, memories, shares = tanned
+    file = written(tmp_path / "a.csv", law, memories, 0.0, shares)
+    text = json.dumps({"shear_modulus": 2000.0, "ratios": [0.5], "relaxation_times": [0.1]})
+    (tmp_path / "fit.json").write_text(text)
+    options = ["--model", str(tmp_path / "fit.json"), "--out", str(tmp_path / "." / ".." / tmp_path.name)]
+    assert command.main(["amplitude", "fung_demiray", str(file), *options]) == 2
+    assert "fit.json would be replaced by the results: give another --out" in capsys.readouterr().err
+    assert (tmp_path / "fit.json").read_text() == text
+
+
 @pytest.mark.parametrize("memory", ["series", "none"])
 def test_a_loss_tangent_that_changes_in_the_law_too_is_no_fault(tmp_path, memory):
     """At strains of 1 to 3, the stresses of higher harmonics relax differently. The program advised to ignore these

@@ -18,7 +18,8 @@ from conftest import ROOT
 
 from fitting.__main__ import main
 from fitting.commands import shared_options, waves
-from fitting.fits import sample_inertia
+from fitting.fits import sample_inertia, samples, viscoelastic
+from fitting.fits.families import springpots_in_time
 from liverjax.__main__ import main as liverjax_main
 from liverjax.commands import exit_codes
 from liverjax.commands.arguments import with_joined_numbers
@@ -207,6 +208,39 @@ def test_output_folder_that_is_a_file(tmp_path, capsys):
     (tmp_path / "out" / "fit.h5").mkdir(parents=True)
     assert main([str(PORCINE), "--out", str(tmp_path / "out")]) == 2
     assert "contains a folder fit.h5" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "name"),
+    [
+        *((command, "--cards", "cards") for command in ("sweep", "relaxation", "samples", "together")),
+        *((command, "--samples=100", "posterior.csv") for command in ("sweep", "relaxation")),
+        ("sweep", "--report", "report.pdf"),
+    ],
+)
+def test_results_that_cannot_be_written_are_found_before_the_fit(command, option, name, tmp_path, monkeypatch, capsys):
+    """The whole fit was computed, and then the command ended with a traceback."""
+
+    def computed(*_):
+        raise AssertionError("the fit begins")
+
+    for fit in (viscoelastic, "choose_modes"), (springpots_in_time, "choose_in_time"), (samples, "fit"):
+        monkeypatch.setattr(*fit, computed)
+    monkeypatch.setattr(springpots_in_time, "choose_together", computed)
+    (tmp_path / "test.csv").write_text("time_s,modulus_Pa\n1,900\n2,800\n3,750\n4,730\n")
+    files = {
+        "sweep": [str(PORCINE)],
+        "relaxation": ["relaxation", str(tmp_path / "test.csv")],
+        "samples": [str(PORCINE), str(LION)],
+        "together": [str(PORCINE), "--with", str(tmp_path / "test.csv")],
+    }
+    if name == "cards":
+        (tmp_path / name).write_text("")
+    else:
+        (tmp_path / name).mkdir()
+    assert main([*files[command], option, "--out", str(tmp_path)]) == 2
+    kind = "file" if name == "cards" else "folder"
+    assert f"contains a {kind} {name}" in capsys.readouterr().err
 
 
 def test_files_of_an_earlier_run_are_found_by_pattern(tmp_path, capsys):

@@ -345,6 +345,9 @@ def test_the_commands_take_a_description(tmp_path):
         ({"test": "sphere"}, "sphere has no key 'height'"),
         ({"height": None}, "tension needs height; give this key in metres"),
         ({"radius": "wide"}, "radius = 'wide' is not a number"),
+        ({"radius": 10**400}, "is not a number; give a number"),
+        ({"test": ["sphere"]}, r"test = \['sphere'\] is not known"),
+        ({"drive": ["force"]}, r"drive = \['force'\] is not known; use displacement or force"),
         ({"radius": 10.0}, "radius = 10 cannot be the size of a sample"),
         (
             {"test": "glued_punch", "punch": 5e-4, "radius": 0.001, "height": 0.02},

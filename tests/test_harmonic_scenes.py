@@ -169,6 +169,15 @@ def test_bad_scene_files_are_refused(tmp_path, capsys, line, more, words):
     assert words in capsys.readouterr().err
 
 
+def test_a_file_in_the_place_of_the_folder_vtu_is_found_before_the_computation(tmp_path, monkeypatch, capsys):
+    """The command ended with a traceback after the computation."""
+    monkeypatch.setattr("liverjax.jobs.waves.solved_waves", lambda *_: pytest.fail("the computation begins"))
+    (tmp_path / "scene.toml").write_text(FILE + "frequencies = [60.0]\n")
+    (tmp_path / "vtu").write_text("")
+    assert main(["simulate", str(tmp_path / "scene.toml"), "--vtu", "--out", str(tmp_path)]) == 2
+    assert "contains a file vtu, but a folder vtu is needed" in capsys.readouterr().err
+
+
 def test_runs_in_time_refuse_a_harmonic_scene():
     scene = slab(2, 1)
     with pytest.raises(lj.InputError, match=r"call lj\.harmonic"):

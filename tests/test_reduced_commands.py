@@ -2,6 +2,7 @@
 
 import argparse
 import inspect
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.commands import reduce
+from liverjax.jobs import reduction
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -95,6 +97,36 @@ def test_a_model_is_not_written_over_a_folder(tmp_path, capsys):
     (tmp_path / "row.csv").write_text("law.mu\n800\n")
     arguments = [str(tmp_path / "scene.toml"), str(tmp_path / "row.csv"), "--out", str(tmp_path)]
     assert main(["reduce", *arguments]) == 2 and "is a folder: name a file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["scene.toml", "row.csv", "notes.txt"])
+def test_a_model_is_not_written_over_another_file(name, tmp_path, monkeypatch, capsys):
+    """The scene file itself was replaced by the model."""
+    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "row.csv").write_text("law.mu\n800\n")
+    (tmp_path / "notes.txt").write_text("mine")
+    before = (tmp_path / name).read_text()
+    monkeypatch.setattr(reduction, "reduce_scene", lambda *_, **__: pytest.fail("the runs begin"))
+    arguments = [str(tmp_path / "scene.toml"), str(tmp_path / "row.csv"), "--out", str(tmp_path / name)]
+    assert main(["reduce", *arguments]) == 2 and (tmp_path / name).read_text() == before
+    assert "exists, and is not a reduced model: name another file" in capsys.readouterr().err
+
+
+def test_the_command_tells_the_path_of_the_model_from_the_scene(tmp_path, monkeypatch, capsys):
+    """The path from the folder of the command was printed, and [solve] of the scene did not find the model."""
+    (tmp_path / "scenes").mkdir()
+    monkeypatch.chdir(tmp_path)
+    model = SimpleNamespace(number_of_modes=3, points=[1], correction=None)
+    monkeypatch.setattr(reduction, "make", lambda *_: model)
+    assert main(["reduce", "scenes/scene.toml", "rows.csv", "--out", "models/m.h5"]) == 0
+    assert 'write reduced = "../models/m.h5" in [solve]' in capsys.readouterr().out
+
+
+def test_a_cell_that_is_too_long_for_a_table_is_told(tmp_path, capsys):
+    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "row.csv").write_text(f"law.mu\n{200_000 * '1'}\n")
+    assert main(["reduce", str(tmp_path / "scene.toml"), str(tmp_path / "row.csv")]) == 2
+    assert "row.csv is not a table (field larger than field limit" in capsys.readouterr().err
 
 
 REFUSED = """

@@ -11,8 +11,13 @@ from test_time_tests import write
 
 from fitting.__main__ import main
 from fitting.commands.together import errors_of_sizes
+from fitting.readers.indentation_curves import read_indentation
+from fitting.readers.rheometer import read_sweep
 from fitting.readers.tables.time_columns import read_columns
 from fitting.readers.time_tests import Sample, read_time_test
+from fitting.waves.dispersion import read_dispersion
+from fitting.waves.files.formats import COLUMNS
+from fitting.waves.wave_field import read_waves
 from liverjax.core.errors import InputError
 
 pytestmark = pytest.mark.quick_to_compile
@@ -54,7 +59,8 @@ def test_headings_of_other_programs_are_read(header, tmp_path):
     ],
 )
 def test_quantities_of_tension_are_made_those_of_shear(header, quantity, factor, tmp_path):
-    rows = "".join(f"{k},{900 - k},{5 + k}\n" for k in range(1, 9))
+    more = header.count(",") > 1
+    rows = "".join(f"{k},{900 - k}{f',{5 + k}' * more}\n" for k in range(1, 9))
     (tmp_path / "t.csv").write_text(header + "\n" + rows)
     columns, notes = read_columns(tmp_path / "t.csv")
     expected = 1e3 * (5 + np.arange(1, 9)) if factor is None else factor * (900 - np.arange(1, 9))
@@ -67,7 +73,7 @@ def test_quantities_of_tension_are_made_those_of_shear(header, quantity, factor,
 @pytest.mark.parametrize("name", ["E(t) [Pa]", "tensile strain,tensile stress [Pa]", "G(t) [Pa]"])
 def test_only_quantities_of_shear_have_the_size_error_of_a_torque(name, tmp_path):
     """Moduli of tension had the error of torque over twist, with the fourth power of the radius."""
-    rows = "".join(f"{k},{0.1 if ',' in name else 900 - k},{900 - k}\n" for k in range(1, 9))
+    rows = "".join(f"{k},{'0.1,' * (',' in name)}{900 - k}\n" for k in range(1, 9))
     (tmp_path / "t.csv").write_text(f"time_s,{name}\n{rows}")
     test = read_time_test(tmp_path / "t.csv", "relaxation", ramp=0)
     expected = np.hypot(50e-6 / 0.02, (4 if name[0] == "G" else 2) * 10e-6 / 0.001)
@@ -206,3 +212,47 @@ def test_rows_that_are_comments_are_not_read(tmp_path):
     (tmp_path / "t.csv").write_text("# no,time,relaxation modulus\n# -,min,kPa\n" + "".join(rows))
     columns, _ = read_columns(tmp_path / "t.csv")
     assert columns["time"][0] == 60 and columns["modulus"].max() == 900e3
+
+
+@pytest.mark.parametrize(
+    ("read", "header", "row"),
+    [
+        (read_columns, "time_s,relaxation_modulus_kPa", "{k},1,856"),
+        (read_columns, "time_s,relaxation_modulus_kPa,", "{k},1,856,"),
+        (read_columns, "# time_s,relaxation_modulus_kPa", "{k},1,856"),
+        (read_indentation, "depth_mm,force_mN", "{k},0,{k}"),
+        (read_dispersion, "frequency_Hz,phase_velocity_m/s", "{k},1,5"),
+        (read_waves, ",".join(COLUMNS), "{k},0,0,1,0,0,0,0,0,5"),
+        (read_sweep, "frequency_Hz,storage_modulus_kPa,loss_modulus_kPa,", "{k},1,856,3,"),
+    ],
+)
+def test_numbers_to_the_right_of_the_last_heading_are_refused(read, header, row, tmp_path):
+    """A decimal comma cut the number: 1,856 kPa became 1 kPa. Remarks and empty cells may follow the numbers."""
+    (tmp_path / "t.csv").write_text(header + "\n" + "".join(row.format(k=k) + "\n" for k in range(1, 9)))
+    with pytest.raises(InputError, match=r"line 2: there are .* write decimals with a point"):
+        read(tmp_path / "t.csv")
+
+
+def test_remarks_and_empty_cells_may_follow_the_numbers(tmp_path):
+    (tmp_path / "t.csv").write_text("time_s,modulus_Pa\n# 1,2,3\n1,900,,\n2,800,dropped,\n3,700\n4,600,\n")
+    assert read_columns(tmp_path / "t.csv")[0]["modulus"].tolist() == [900, 800, 700, 600]
+
+
+@pytest.mark.parametrize("header", ["time_s,modulus_Pa", "time_s,compliance_1/Pa", "time_s,force_nN,displacement_m"])
+def test_a_number_beyond_any_measurement_is_refused(header, tmp_path):
+    """9.91e37, which instruments write for a missing value, was fitted as a modulus."""
+    more = ",1e-3" * (header.count(",") - 1)
+    (tmp_path / "t.csv").write_text(
+        header + "\n" + "".join(f"{k},{9.91e37 if k == 4 else k}{more}\n" for k in range(9))
+    )
+    with pytest.raises(InputError, match=r"9.91e.37 is beyond any measurement; correct the unit or the row"):
+        read_columns(tmp_path / "t.csv")
+
+
+@pytest.mark.parametrize("speed", ["1e300", "1e-300"])
+def test_a_velocity_beyond_any_measurement_is_refused(speed, tmp_path):
+    """Its modulus was infinite or 0."""
+    rows = "".join(f"{hertz},{speed if hertz == 20 else 2}\n" for hertz in (10, 20, 40, 80))
+    (tmp_path / "w.csv").write_text("frequency_Hz,phase_velocity_m/s\n" + rows)
+    with pytest.raises(InputError, match=r"velocity 1e.?300 is beyond any measurement; correct the unit or this row"):
+        read_dispersion(tmp_path / "w.csv")

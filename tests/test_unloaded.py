@@ -317,6 +317,38 @@ solve = {reduced = "model.h5"}
     assert '[mesh] is = "loaded" cannot be used with reduced models' in said and said.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("option", "blocked", "words"),
+    [
+        ("--vtu", "vtu", "contains a file vtu"),
+        ("--png", "result.png/", "contains a folder result.png"),
+        ("--reactions", "reactions.csv/", "contains a folder reactions.csv"),
+        ("--every=0", "", "--every 0 must be above 0"),
+        ("--vtu", "result.h5.parts/", "contains an unfinished run"),
+    ],
+)
+def test_outputs_are_checked_before_the_unloaded_shape_is_sought(option, blocked, words, tmp_path, monkeypatch, capsys):
+    """The checks came after the search, and those of the side files after the run, with a traceback."""
+
+    def sought(_):
+        raise AssertionError("the search begins")
+
+    monkeypatch.setattr("liverjax.simulation.run.unloaded", sought)
+    (tmp_path / "scene.toml").write_text(
+        """mesh = {shape = "box", size = [0.02, 0.02, 0.02], cells = [1, 1, 1], is = "loaded"}
+law = {name = "neo_hookean", mu = 770.0, bulk = 2200.0}
+fixed = [{where = {z_max = 0.0}}]
+"""
+    )
+    if blocked.endswith("/"):
+        (tmp_path / blocked).mkdir()
+    elif blocked:
+        (tmp_path / blocked).write_text("")
+    assert main(["simulate", str(tmp_path / "scene.toml"), option, "--out", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert words in said and said.count("\n") == 1
+
+
 def test_what_cannot_be_is_said():
     with pytest.raises(InputError, match="is = 'slack' is not known"):
         scene_from(content(mesh=content()["mesh"] | {"is": "slack"}))

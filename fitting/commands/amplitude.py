@@ -61,7 +61,8 @@ def run(options: argparse.Namespace) -> int:
     plates = [] if options.plates else ["parallel plates are assumed; for cone and plate, give --plates cone"]
     for note in [*sweep.notes, *plates, *(n for candidate in candidates for n in candidate.notes)]:
         print(f"note: {note}", file=sys.stderr)
-    writable(options.out, ("fit.json", "fit.png"))
+    read = [options.sweep] if options.model is None else [options.sweep, options.model]
+    writable(options.out, ("fit.json", "fit.png"), inputs=read)
     bar = tqdm(candidates, unit=" laws", disable=None, leave=False)
     fits = [law_fit.fit_law(candidate, sweep, memory, options.plates or "parallel") for candidate in bar]
     wrong = shared_options.laws_without_finite_stress([fit.law for fit in fits], "this sweep")

@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> int:
     for note in [*notes, *(n for candidate in candidates for n in candidate.notes)]:
         print(f"note: {note}", file=sys.stderr)
     stress_stretch.initial_modulus(found)
-    writable(options.out, ("curves.json", "curves.png"))
+    writable(options.out, ("curves.json", "curves.png"), inputs=options.files)
     bar = tqdm(candidates, unit=" laws", disable=None, leave=False)
     fits = [stress_stretch.fit(candidate, found) for candidate in bar]
     wrong = shared_options.laws_without_finite_stress(fits, "these curves")

@@ -101,7 +101,7 @@ def _fit_few_numbers(options: argparse.Namespace, problem: Problem) -> int:
         numbers_at(problem.scenes[0], name)
         if names.count(name) > 1:
             raise InputError(f"--parameters names {name} twice: remove one")
-    writable(options.out, ("field.json",))
+    writable(options.out, ("field.json",), inputs=options.files)
     bar, told = cost_bar("iterations")
     with bar:
         found = scene_numbers.fit_numbers(problem, names, progress=told)
@@ -122,7 +122,8 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
             "has no value there; to map these elements too, remove this parameter from the region",
             file=sys.stderr,
         )
-    writable(options.out, ("field.json", "field.vtu", "field.h5", "field.png", "progress.h5"))
+    files = ("field.json", "field.vtu", "field.h5", "field.png", "progress.h5")
+    writable(options.out, files, inputs=options.files)
     kept = sum(gradients.memory(scene) for scene in problem.scenes) / 1e6
     print(f"gradients need about {kept:.0f} MB of memory", file=sys.stderr)
     length = options.length or float(np.ptp(np.asarray(mesh.points), axis=0).max()) / 10

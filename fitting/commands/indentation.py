@@ -78,7 +78,7 @@ def run(options: argparse.Namespace) -> int:
     layer, curve = Layer(rig), read_indentation(options.file)
     for note in (*_notes_on_shape(options), *curve.notes):
         print(f"note: {note}", file=sys.stderr)
-    writable(options.out, ("fit.json", "fit.png"))
+    writable(options.out, ("fit.json", "fit.png"), inputs=[options.file])
     found = None
     if layer.deepest > 2 * SHALLOWEST * (curve.depth.max() - curve.depth.min()):
         found = fit_with_offset(curve.depth, curve.force, layer.force, layer.deepest)

@@ -103,7 +103,6 @@ def run(options: argparse.Namespace) -> int:
     from fitting.fits.simulated_rheometer import Simulation
     from fitting.readers import time_tests as reader
     from fitting.reports import time_report
-    from liverjax.core.files import writable
 
     for name in ("radius", "height"):
         value = getattr(options, name)
@@ -122,7 +121,7 @@ def run(options: argparse.Namespace) -> int:
         test = reader.read_time_test(options.file, options.kind, sample, options.ramp, options.min_time)
     for note in (*test.notes, *_said_of_rows(test)):
         print(f"note: {note}", file=sys.stderr)
-    writable(out, ("fit.json", "fit.png"))
+    shared_options.prepare_outputs(options, ("fit.json", "fit.png"), [options.file])
     found = fits.choose_in_time(test, options.model, options.modes)
     if options.file.suffix.lower() != ".toml":  # this error is only for tests in a rheometer
         default = Simulation()

@@ -20,7 +20,6 @@ def run(options: argparse.Namespace) -> int:
     from fitting.fits.honesty import total_error
     from fitting.fits.simulated_rheometer import Simulation
     from fitting.reports import samples_report
-    from liverjax.core.files import writable
 
     sweeps: list[Sweep] = []
     for path in options.sweep:
@@ -30,7 +29,7 @@ def run(options: argparse.Namespace) -> int:
                 raise InputError(f"{path} has the same moduli as {earlier.source}: give each measurement once")
         for note in sweeps[-1].notes:
             print(f"note: {path.name}: {note}", file=sys.stderr)
-    writable(options.out, ("fit.json", "fit.png", "fit.h5"))
+    shared_options.prepare_outputs(options, ("fit.json", "fit.png", "fit.h5"), options.sweep)
     with named_bar(f"{len(sweeps)} samples") as told:
         found = samples.fit(sweeps, options.model, options.modes, told)
     for path, sweep, corrected in zip(options.sweep, sweeps, found.sweeps, strict=True):

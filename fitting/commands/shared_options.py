@@ -4,6 +4,7 @@ a sweep in closed form."""
 import argparse
 import contextlib
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -100,6 +101,14 @@ def write_cards(out: Path, model: "Maxwell", of_fit: "Estimate | None" = None) -
     print(f"written: {out}/cards")
 
 
+def prepare_outputs(options: argparse.Namespace, files: tuple[str, ...], inputs: Iterable[Path]) -> None:
+    """Make the folder of the results, and check that all results can be written: `files`, and those that --samples,
+    --report and --cards request. No result may replace one of the `inputs`."""
+    asked = {"posterior.csv": options.samples, "report.pdf": getattr(options, "report", False)}
+    names = (*files, *(name for name, wanted in asked.items() if wanted))
+    writable(options.out, names, ("cards",) if options.cards else (), inputs)
+
+
 def usable_sweep(options: argparse.Namespace, path: Path, error_is_fitted: bool = False) -> "Sweep":
     """Read a sweep, and ignore the points at which the instrument dominates. If --max-frequency is given, only these
     points are ignored: points outside the band, and points at which the raw torque or the raw phase shows too much
@@ -191,7 +200,7 @@ def _with_instrument(options: argparse.Namespace, sweep: "Sweep", factors: "Shar
     if options.modes != "auto":
         viscoelastic.check_modes(sweep, options.modes)
     dense = instrument.spectrum_before_correction(sweep)
-    writable(options.out, ("fit.json", "fit.png", "fit.h5"))
+    prepare_outputs(options, ("fit.json", "fit.png", "fit.h5"), [*options.sweep, *options.predict])
     fit = _uncorrected(options, sweep, dense)
     if factors is not None:
         fit = compressed_sample.of_compressed_sample(fit, sweep, factors)

@@ -11,7 +11,6 @@ from fitting.commands.exit_codes import EXIT_CODES
 from fitting.commands.progress import cost_bar
 from liverjax import laws
 from liverjax.core.errors import InputError
-from liverjax.core.files import writable
 from liverjax.core.plotting import import_meanwhile
 from liverjax.core.struct import Content
 
@@ -212,7 +211,8 @@ def _master(options: argparse.Namespace) -> tuple["Sweep", dict, str]:
     band = options.min_frequency, options.max_frequency
     data = temperature_sweeps.with_usable_points(data, band, options.radius, options.height)
     found = master_curve.master_curve(data, reference, options.vertical)
-    writable(options.out, ("shift_factors.csv", "master_curve.csv", "shift.png"))
+    files = ("shift_factors.csv", "master_curve.csv", "shift.png", "fit.json", "fit.png", "fit.h5")
+    shared_options.prepare_outputs(options, files, [*options.sweep, *options.predict])
     master_report.write_master_curve(options.out, found)
     table = master_report.shift_table(found)
     print(table)

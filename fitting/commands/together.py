@@ -19,7 +19,6 @@ def run(options: argparse.Namespace) -> int:
     """Fit all tests in closed form. The exit code is 1 if the fit did not converge."""
     from fitting.fits.families import springpots_in_time
     from fitting.reports import together_report
-    from liverjax.core.files import writable
 
     first = shared_options.usable_sweep(options, options.sweep[0])
     tests = [first, *(read_any(options, path) for path in options.others)]
@@ -27,7 +26,7 @@ def run(options: argparse.Namespace) -> int:
     for test in tests:
         for note in test.notes:
             print(f"note: {Path(test.source).name}: {note}", file=sys.stderr)
-    writable(options.out, ("fit.json", "fit.png"))
+    shared_options.prepare_outputs(options, ("fit.json", "fit.png"), [*options.sweep, *options.others])
     relative = errors_of_sizes(options, tests)
     with named_bar(f"{len(tests)} tests") as told:
         found = springpots_in_time.choose_together(tests, options.model, options.modes, told, relative)

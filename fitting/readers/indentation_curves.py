@@ -11,6 +11,7 @@ from fitting.readers.tables.text_tables import (
     decimal_sign,
     delimiter_of_header,
     means_nothing,
+    refuse_unnamed_numbers,
     split_cells,
     text_of,
     to_number,
@@ -260,7 +261,9 @@ def _in_si_units(
     if rows and means_nothing(rows[0][1][p.column] for p in found.values() if p.column < len(rows[0][1])):
         rows = rows[1:]  # this row contains the units, not numbers
     sign, kept, empty = decimal_sign(cell for _, cells in rows for cell in cells), [], 0
+    headings = split_cells(lines[head], delimiter)
     for number, cells in rows:
+        refuse_unnamed_numbers(path, number, cells, headings)
         shown = [cells[p.column] if p.column < len(cells) else "" for p in found.values()]
         values = [to_number(cell, delimiter, sign) for cell in shown]
         wrong = [cell for cell, value in zip(shown, values, strict=True) if value is None or np.isinf(value)]

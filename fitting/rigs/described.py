@@ -28,6 +28,7 @@ from fitting.readers.tables.time_columns import read_columns
 from fitting.readers.time_tests import TimeTest, from_rest, of_columns, with_known_rise
 from fitting.rigs import glued, thin_layer
 from fitting.rigs.compression import smooth_force
+from liverjax.core.bounds import finite
 from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
 from liverjax.core.status import NAMES, most_severe
@@ -227,10 +228,10 @@ def _description(path: Path) -> Described:
         table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}): give a TOML file that describes a test") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:  # TOML, coding, or a whole number with more digits than Python reads
         raise InputError(f"{path} is not valid TOML ({error}): correct this line") from None
     test = table.get("test")
-    if test not in TESTS:
+    if test not in tuple(TESTS):  # a list from the file could not be looked up in a dictionary
         raise InputError(f"{path}: test = {test!r} is not known: {hint(str(test), TESTS)}")
     needed, known = TESTS[test], (*_OTHER, *TESTS[test])
     for key in table:
@@ -253,7 +254,7 @@ def _description(path: Path) -> Described:
     if not isinstance(table["data"], str):
         raise InputError(f"{path}: data = {table['data']!r} must name a file; write data = 'test.csv'")
     drive = table.get("drive", "displacement")
-    if drive not in _KINDS:
+    if drive not in tuple(_KINDS):
         raise InputError(f"{path}: drive = {drive!r} is not known; use displacement or force")
     first = _number_of(path, "min_time", table.get("min_time", 0.0))
     if first < 0:
@@ -270,7 +271,7 @@ def _description(path: Path) -> Described:
 
 
 def _number_of(path: Path, key: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not finite(value):
         raise InputError(f"{path}: {key} = {value!r} is not a number; give a number")
     return float(value)
 

@@ -10,7 +10,10 @@ import numpy as np
 import scipy.special
 
 from fitting.readers.frequency_sweep import distances_from_polynomials, merged, smooth_curve
+from fitting.readers.rheometer import LARGEST, SMALLEST
 from fitting.readers.tables.text_tables import (
+    refuse_unnamed_numbers,
+    split_cells,
     split_line,
     text_of,
     to_number,
@@ -122,6 +125,9 @@ def read_dispersion(path: str | os.PathLike, density: float | None = None) -> Di
         bad = np.flatnonzero(~(np.isfinite(values) & (values > 0)))
         if bad.size:
             raise InputError(f"{path}: {quantity} {values[bad[0]]:g} must be above 0; correct or remove this row")
+        far = values[(values < SMALLEST) | (values > LARGEST)]
+        if far.size:
+            raise InputError(f"{path}: {quantity} {far[0]:g} is beyond any measurement; correct the unit or this row")
     if len(np.unique(columns["frequency"])) < FEWEST:
         raise InputError(
             f"{path}: {len(order)} rows of numbers follow the header; give at least {FEWEST} different frequencies"
@@ -206,11 +212,12 @@ def _columns(path: str, lines: list[str], header: tuple) -> dict[str, np.ndarray
         if unit and unit not in known:
             raise InputError(f"{path}: unit {unit!r} of {quantity} is not known; use {', '.join(known)}")
         factors[quantity] = known[unit] if unit else next(iter(known.values()))
-    rows = []
+    rows, headings = [], split_cells(lines[k].lstrip("# "), delimiter)
     for number, line in enumerate(lines[k + 1 :], k + 2):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
-        _, cells = split_line(line, delimiter)
+        cells = split_cells(line, delimiter)
+        refuse_unnamed_numbers(path, number, cells, headings)
         values = [to_number(cells[p], delimiter) if p < len(cells) else None for p, _ in found.values()]
         if not all(v is not None and np.isfinite(v) for v in values):
             raise InputError(

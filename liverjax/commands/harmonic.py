@@ -22,7 +22,7 @@ def run(options: argparse.Namespace, scene: "Scene", text: str) -> int:
 
     target = options.out / "result.h5"
     _refuse_options(options, target)
-    writable(options.out, (target.name,))
+    writable(options.out, (target.name,), ("vtu",) if options.vtu else ())
     ran = waves.solved_waves(scene, options.about, options.mesh_error)
     waves.write_waves(
         target, scene, ran, {"scene": text, "run_time_s": ran.seconds, "warnings": ran.cautions, "versions": versions()}

@@ -2,6 +2,7 @@
 table."""
 
 import argparse
+import os
 from pathlib import Path
 
 
@@ -45,5 +46,7 @@ def run(options: argparse.Namespace) -> int:
     print(
         f"{model.number_of_modes} modes, {len(model.points)} points, {reduction.learnt(model)}\nwritten: {options.out}"
     )
-    print(f'to use this model, write reduced = "{options.out}" in [solve]')
+    # The path in a scene file is relative to the folder of this file.
+    path = os.path.relpath(options.out.resolve(), options.scene.parent.resolve())
+    print(f'to use this model, write reduced = "{Path(path).as_posix()}" in [solve]')
     return 0

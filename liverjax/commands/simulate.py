@@ -66,12 +66,12 @@ def run(options: argparse.Namespace) -> int:
     if scene.solve.kind == "harmonic":
         return harmonic.run(options, scene, text)
     _check_before_steps(options, scene)
+    target = options.out / "result.h5"
+    _check_outputs(options, target, scene, reactions)
+    long_run.refuse_unfinished(target, options.resume, text)
     given = scene.points_are
     if given == "loaded":
         scene = unloaded(scene).scene
-    target = options.out / "result.h5"
-    writable(options.out, (target.name,))
-    long_run.refuse_unfinished(target, options.resume, text)
     bar = tqdm(total=scene.solve.steps, unit="step", disable=None, leave=False)  # shown only on a terminal
     report = None if bar.disable else lambda _: bar.update()
     try:
@@ -91,8 +91,6 @@ def run(options: argparse.Namespace) -> int:
     found = fields.fields(scene, ran.result, names) if names else {}
     said = [*cautions_of_run(replace(scene, points_are=given), ran.result), *unknown]
     _write_and_tell((scene, text, said), ran, target, found)
-    if in_parts:
-        long_run.remove_parts(target)
     written = [str(target)]
     if reactions:
         output.write_reactions(options.out / "reactions.csv", scene, ran.result)
@@ -102,6 +100,8 @@ def run(options: argparse.Namespace) -> int:
     if options.png:
         output.picture(options.out / "result.png", scene, ran.result)
         written.append(str(options.out / "result.png"))
+    if in_parts:
+        long_run.remove_parts(target)
     print(f"written: {', '.join(written)}")
     codes = np.asarray(ran.result.status)
     for step in np.flatnonzero(codes != status.CONVERGED)[:5]:
@@ -126,17 +126,27 @@ def _asked_for(options: argparse.Namespace, scene: "Scene", text: str) -> tuple[
 
 def _check_before_steps(options: argparse.Namespace, scene: "Scene") -> None:
     """Raise `InputError` if a static or dynamic scene and the options cannot be used together."""
+    from liverjax.jobs.long_run import check_every
     from liverjax.simulation import automatic
     from liverjax.simulation.mesh_error import refuse
 
     if options.about:
         raise InputError("--about can be used only with [solve] kind = 'harmonic': remove --about")
+    check_every(_steps_per_part(options))
     if scene.solve.reduced and scene.points_are == "loaded":
         from liverjax.reduced.model import refuse_unknown_physics
 
         refuse_unknown_physics(scene)
     if options.mesh_error:
         refuse(automatic.chosen(scene))
+
+
+def _check_outputs(options: argparse.Namespace, target: Path, scene: "Scene", reactions: bool) -> None:
+    """Raise `InputError` if one of the results cannot be written."""
+    asked = {target.name: True, "reactions.csv": reactions, "result.png": options.png}
+    files = tuple(name for name, wanted in asked.items() if wanted)
+    model = (Path(scene.solve.reduced),) if scene.solve.reduced else ()
+    writable(options.out, files, ("vtu",) if options.vtu else (), model)
 
 
 def _reduced(scene: "Scene") -> tuple["Ran | None", "Scene"]:

@@ -7,7 +7,7 @@ import glob
 import hashlib
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from uuid import uuid4
@@ -17,17 +17,31 @@ import numpy as np
 from liverjax.core.errors import InputError
 
 
-def writable(out: Path, files: tuple[str, ...]) -> None:
-    """Make the folder `out` for the results `files`, and check that files can be written into this folder.
+def writable(out: Path, files: tuple[str, ...], folders: tuple[str, ...] = (), inputs: Iterable[Path] = ()) -> None:
+    """Make the folder `out` for the results, and check that files can be written into this folder.
+
+    Args:
+        out: folder of the results.
+        files: names of the files that will be written.
+        folders: names of the folders that will be made in `out`.
+        inputs: files that are read, and must not be replaced by `files`.
 
     Raises:
-        InputError: `out` is a file or cannot be written, or one of `files` is a folder.
+        InputError: `out` is a file or cannot be written, one of `files` is a folder or one of `inputs`, or one of
+            `folders` is a file.
     """
     if out.exists() and not out.is_dir():
         raise InputError(f"--out {out} is a file: name a folder for the results")
     for name in files:
         if (out / name).is_dir():
             raise InputError(f"--out {out} contains a folder {name}: name another folder for the results")
+    for name in folders:
+        if (out / name).exists() and not (out / name).is_dir():
+            raise InputError(f"--out {out} contains a file {name}, but a folder {name} is needed: name another folder")
+    written = {(out / name).resolve() for name in files}
+    for path in inputs:
+        if path.resolve() in written:
+            raise InputError(f"{path} would be replaced by the results: give another --out")
     try:
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=out):

@@ -60,6 +60,12 @@ def refuse_unfinished(out: Path, resume: bool, text: str | None = None) -> None:
             raise InputError(f"{out} is the result of another scene: give another --out, or remove --resume")
 
 
+def check_every(every: int) -> None:
+    """Raise `InputError` if the number of steps per part is below 1."""
+    if every < 1:
+        raise InputError(f"--every {every} must be above 0: give e.g. 50")
+
+
 def remove_parts(out: Path) -> None:
     """Remove the parts of the finished run `out`, if there are parts. If another process uses them, they stay, and that
     process removes them at its end."""
@@ -94,8 +100,7 @@ def run(
         OSError: the disk is full; finished parts are kept.
     """
     steps, folder = scene.solve.steps, resumable_parts.beside(out)
-    if every < 1:
-        raise InputError(f"--every {every} must be above 0: give e.g. 50")
+    check_every(every)
     refuse_unfinished(out, resume)
     scene = prepared(scene)
     if steps <= every and not folder.exists():

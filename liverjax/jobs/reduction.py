@@ -57,6 +57,7 @@ def make(
         raise InputError(f"--out {out} cannot be used, because the folder {out.parent} {wrong}")
     if out.is_dir():
         raise InputError(f"--out {out} is a folder: name a file for the model, e.g. {out / 'model.h5'}")
+    _refuse_other_content(out)
     writable(out.parent, ())
     table = read_sweep(scene_file, rows_file)
     scene = replace(table.scene, solve=replace(table.scene.solve, reduced=""))
@@ -64,6 +65,16 @@ def make(
     model = reduce_scene(scene, rows, tolerance, modes, runs=runs)
     save_reduced(model, out, scene_file.read_text(encoding="utf-8-sig"))
     return model
+
+
+def _refuse_other_content(out: Path) -> None:
+    """Raise `InputError` if a file `out` exists and is no reduced model, for example the scene file."""
+    if not out.exists():
+        return
+    try:
+        load_reduced(out)
+    except InputError:
+        raise InputError(f"--out {out} exists, and is not a reduced model: name another file for the model") from None
 
 
 def tried(scene: Scene) -> Tried:

@@ -173,7 +173,10 @@ def read_table(file: Path) -> tuple[tuple[str, ...], np.ndarray]:
     for mark, name in ((";", "semicolons"), ("\t", "tabs")):
         if lines and mark in lines[0] and "," not in lines[0]:
             raise InputError(f"{file} has {name} between its cells: write commas between cells, and decimal points")
-    table = [[cell.strip() for cell in row] for row in csv.reader(lines)]
+    try:
+        table = [[cell.strip() for cell in row] for row in csv.reader(lines)]
+    except csv.Error as error:
+        raise InputError(f"{file} is not a table ({error}): give a CSV file of parameters") from None
     if len(table) < 2:
         raise InputError(f"{file} has no rows: give a header of dotted names, e.g. law.mu, and one row per run")
     names = tuple(table[0])

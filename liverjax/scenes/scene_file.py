@@ -86,7 +86,7 @@ def load_scene(path: str | Path) -> Scene:
         raise InputError(f"{path} cannot be read ({error.strerror}): give a scene file (TOML)") from None
     except UnicodeDecodeError:
         raise InputError(f"{path} is not a text file: give a scene file (TOML)") from None
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:  # also a whole number with more digits than Python reads
         raise InputError(f"{path} is not valid TOML ({error}): correct this line") from None
     try:
         return scene_from(content, path.parent)

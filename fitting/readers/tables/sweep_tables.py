@@ -26,6 +26,7 @@ from fitting.readers.tables.text_tables import (
     delimiter_of_header,
     find_delimiter,
     means_nothing,
+    refuse_unnamed_numbers,
     split_cells,
     summary_rows,
     to_number,
@@ -147,7 +148,7 @@ def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
         name = _title(lines[free : k - 1])
         columns, k = _with_unit_row(columns, lines, k, delimiter)
         above = k
-        rows, numbers, notes, k = _rows_below(path, columns, lines, k, delimiter, len(cells))
+        rows, numbers, notes, k = _rows_below(path, columns, lines, k, delimiter, cells)
         if rows:
             units = [split_cells(line, delimiter) for line in lines[headers[-1] : above]]
             own = [split_cells(lines[n - 1], delimiter) for n in numbers]
@@ -256,7 +257,7 @@ def _with_unit_row(columns: list[Column], lines: list[str], k: int, delimiter: s
     return columns, k
 
 
-def _rows_below(path, columns, lines, k, delimiter, width):
+def _rows_below(path, columns, lines, k, delimiter, headings):
     """Return the rows of numbers below a header, their line numbers, and the index of the line after them. An empty
     cell is NaN."""
     needed = [c for c in columns if not c.quantity.endswith("_sd")]
@@ -284,10 +285,7 @@ def _rows_below(path, columns, lines, k, delimiter, width):
                 notes.append(f"line {k + 1}, {_line_shown(line)}, has no numbers, and the rows below it are not read")
             break  # the header was only a title, or this table ends
         k += 1
-        if len([c for c in cells if c]) > width:
-            raise InputError(
-                f"{path}: line {k}: there are {len(cells)} cells under {width} headings; write decimals with a point"
-            )
+        refuse_unnamed_numbers(path, k, cells, headings)
         every.append(cells)
         numbers.append(k)
     summaries = summary_rows(every)

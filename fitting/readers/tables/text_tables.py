@@ -4,6 +4,7 @@ import codecs
 import csv
 import itertools
 import math
+import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -135,6 +136,22 @@ def split_cells(line: str, delimiter: str) -> list[str]:
     if delimiter in (" ", "  "):
         return re.split(r"\s{2,}" if delimiter == "  " else r"\s+", line.strip())
     return [c.strip() for c in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])]
+
+
+def refuse_unnamed_numbers(path: str | os.PathLike, number: int, cells: list[str], headings: list[str]) -> None:
+    """Raise `InputError` if line `number` has a number in a cell to the right of the last heading.
+
+    Decimal commas in a table with commas between its cells give such lines. Remarks and empty cells may follow the
+    numbers.
+    """
+    width = len(headings)
+    while width and not headings[width - 1].strip('" '):
+        width -= 1
+    if any(re.match(r"[-+]?[.,]?\d", cell) for cell in cells[width:]):
+        raise InputError(
+            f"{path}: line {number}: there are {len(cells)} cells under {width} headings; write decimals with a point, "
+            "and give every column a heading"
+        )
 
 
 #: Strings in cells without a measurement.

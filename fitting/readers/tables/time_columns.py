@@ -10,11 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
+from fitting.readers.rheometer import LARGEST
 from fitting.readers.tables.text_tables import (
     EMPTY,
     decimal_sign,
     delimiter_of_header,
     means_nothing,
+    refuse_unnamed_numbers,
     split_cells,
     split_line,
     summary_rows,
@@ -329,12 +331,14 @@ def _rows_in_time(path, lines, k, delimiter, found):
     header, lines that begin with `#` are comments; only a line of units may begin so."""
     kept, numbers, every, units, notes = [], [], [], {}, []
     needed = {q: place for q, (place, _) in found.items()}
+    headings = split_cells(lines[k - 1].lstrip("# "), delimiter)
     while k < len(lines):
         line = lines[k]
         k += 1
         _, cells = split_line(line, delimiter)
         own = [cells[p] if p < len(cells) else "" for p in needed.values()]
         if not means_nothing(own) and not line.lstrip().startswith("#"):
+            refuse_unnamed_numbers(path, k, cells, headings)
             kept.append(own)
             every.append(cells)
             numbers.append(k)
@@ -396,4 +400,11 @@ def _in_si(path, found, rows, units):
     good = np.all(np.isfinite(rows), axis=1)
     if not good.all():
         notes.append(f"{(~good).sum()} of {len(good)} rows are ignored, because a cell is empty or not finite")
-    return {q: v[good] for q, v in columns.items()}, notes
+    columns = {q: v[good] for q, v in columns.items()}
+    for (quantity, values), written in zip(columns.items(), rows[good].T, strict=True):
+        far = np.maximum(np.abs(values), np.abs(written)) > LARGEST  # some instruments write 9.91e37 for no value
+        if far.any():
+            raise InputError(
+                f"{path}: {quantity} = {written[far][0]:g} is beyond any measurement; correct the unit or the row"
+            )
+    return columns, notes

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fitting.readers.tables.text_tables import find_delimiter, split_cells, text_of, to_number
+from fitting.readers.tables.text_tables import find_delimiter, refuse_unnamed_numbers, split_cells, text_of, to_number
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
@@ -238,7 +238,8 @@ def _voxel_table(path: Path) -> Content:
         )
     rows = np.full((len(lines) - 1, len(head)), np.nan)
     for k, (number, line) in enumerate(lines[1:]):
-        cells = [_quick_number(cell, between) for cell in split_cells(line, between)[: len(head)]]
+        refuse_unnamed_numbers(path, number, written := split_cells(line, between), head)
+        cells = [_quick_number(cell, between) for cell in written[: len(head)]]
         if None in cells:
             raise InputError(f"{path}: row {number}: {line[:40]!r} has a cell that is not a number; correct this row")
         rows[k, : len(cells)] = cells
