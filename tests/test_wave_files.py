@@ -413,8 +413,21 @@ def test_labels_that_lie_elsewhere_than_the_waves_are_refused(tmp_path, turned):
         with pytest.raises(InputError, match="the voxels are not at the positions of the voxels of the waves"):
             wave_field.read_waves(tmp_path / "w.nii", labels=tmp_path / "l.nii", frequencies=list(HERTZ))
         return
-    read = wave_field.read_waves(tmp_path / "w.nii", labels=tmp_path / "l.nii", frequencies=list(HERTZ))
-    assert np.array_equal(read.labels, labels)
+    for shape in (labels.shape, (*labels.shape, 1)):  # a mask may have a fourth axis, but such labels were refused
+        nibabel.save(nibabel.Nifti1Image(labels.reshape(shape), affine), tmp_path / "l.nii")
+        read = wave_field.read_waves(tmp_path / "w.nii", labels=tmp_path / "l.nii", frequencies=list(HERTZ))
+        assert np.array_equal(read.labels, labels)
+
+
+@pytest.mark.parametrize("micro", ["\u00b5", "\u03bc"])  # two letters that look the same
+def test_both_letters_for_micro_are_known(tmp_path, micro):
+    field = plane_waves((5, 5, 5))
+    arrays = {"displacement": 1e6 * field.displacement, "spacing": field.spacing, "frequencies": HERTZ}
+    np.savez(tmp_path / "w.npz", **arrays, unit=f"{micro}m")
+    for unit in (None, "\u00b5m", "\u03bcm"):
+        found = wave_field.read_waves(tmp_path / "w.npz", unit=unit)
+        np.testing.assert_allclose(found.displacement, field.displacement, rtol=1e-12)
+        assert not any("--unit" in note for note in found.notes)
 
 
 def test_a_mask_must_be_near_the_waves_at_every_corner(tmp_path):

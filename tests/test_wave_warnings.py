@@ -9,6 +9,7 @@ from test_waves import DENSITY, HERTZ, H, plane_waves
 from fitting.reports.waves import cautions, report
 from fitting.waves import (
     elastography,
+    regions,
     wave_field,
 )
 from fitting.waves.files import components
@@ -137,7 +138,7 @@ def test_scales_that_no_tissue_has_are_told(moduli, words):
     G = np.array(moduli)[:, None]
     own = SimpleNamespace(waves=SimpleNamespace(omega=2 * np.pi * np.array([50.0, 75.0])), density=DENSITY)
     found = SimpleNamespace(whole=SimpleNamespace(modulus=G, standard_errors=0.01 * np.abs(G) * (1 + 1j)))
-    said = cautions._of_scales(own, found)
+    said = cautions._of_scales(own, found, [0, 1])
     assert len(said) == bool(words) and all(words in s for s in said)
 
 
@@ -155,7 +156,7 @@ def test_moduli_have_no_preferred_size():
         each = elastography.regions_of(organ)
         assert np.all(each.whole.converged)
         found.append(each.whole.modulus[:, 0] / scale)
-        said = cautions._of_scales(organ, each)
+        said = cautions._of_scales(organ, each, [0, 1])
         assert ["check the spacing" in s for s in said] == [True] * (scale != 1)
     np.testing.assert_allclose(found, np.broadcast_to(found[0], (3, 2)), rtol=1e-4)
 
@@ -168,6 +169,49 @@ def test_the_typical_modulus_comes_from_the_frequency_with_the_clearest_motion()
     poor = field._replace(displacement=U, noise=np.array([sd, field.noise[1]]))
     organ = elastography.organ_of(poor, elastography.body_of(poor), DENSITY)
     assert 2400 < organ.matrices.typical < 3600
+
+
+def test_a_frequency_of_noise_does_not_spoil_the_others():
+    """The search at 60 Hz started from the modulus of the noise and found 0.02 Pa instead of 3000 Pa, and so did the
+    search for the regions. Warnings were about the labels, the size of the regions and the spacing.
+    """
+    good, rng, labels = plane_waves((7, 7, 7), noise=3e-8), np.random.default_rng(7), np.zeros((7, 7, 7), int)
+    U = good.displacement[[0, 0]]
+    U[0] = 1e-6 * (rng.standard_normal(U[0].shape) + 1j * rng.standard_normal(U[0].shape))
+    labels[..., 3:] = 1
+    own = good._replace(displacement=U, noise=np.array([1e-6, 3e-8]), labels=labels, frequencies=np.array([20.0, 60.0]))
+    organ = elastography.organ_of(own, elastography.body_of(own), DENSITY)
+    found = elastography.regions_of(organ)
+    for each in (found.whole, found.parts):
+        assert each.converged[1]
+        np.testing.assert_allclose(each.modulus[1].real, 3000, rtol=0.05)
+    assert abs(found.whole.modulus[0, 0]) < 300  # the search in noise also converges, but to another modulus
+    (said,) = cautions.cautions_of_elastography(organ, found, None)
+    assert said.startswith("20 Hz: the displacements") and said.endswith("remove the data of this frequency")
+
+
+def test_a_region_without_equations_hides_no_warning_of_other_regions():
+    """Its standard error was NaN, and the largest of several numbers with NaN is NaN."""
+    blank = {"farther": np.zeros((1, 2)), "chi2": np.ones(1), "iterations": np.ones(1), "converged": np.ones(1, bool)}
+    covariance = np.diag([100.0, np.inf, 100.0, np.inf])[None]
+    parts = regions.Regions(np.full((1, 2), 3000 + 600j), covariance, components=1, **blank)
+    assert parts.standard_errors[0, 0] == 10 + 10j
+    assert np.isposinf(parts.standard_errors[0, 1].real) and np.isposinf(parts.standard_errors[0, 1].imag)
+    bias = np.full((1, 2), 0.02 + 0j)
+    found = elastography.Found(parts, np.array([4, 7]), parts, bias[:, 0], bias, bias)
+    (said,) = cautions._of_voxel_size(60.0, found, 0)
+    assert "the modulus of region 4 by 2 %" in said
+
+
+def test_fields_without_a_common_voxel_are_told():
+    """The message was that all three components have to be measured, although they were."""
+    field = plane_waves((7, 7, 7))
+    field.displacement[0, :4], field.displacement[1, 4:] = np.nan, np.nan
+    with pytest.raises(InputError, match="no voxel is measured at all frequencies; fit each frequency separately"):
+        elastography.body_of(field)
+    field.displacement[0, ..., 2] = np.nan
+    with pytest.raises(InputError, match="measure all three"):
+        elastography.body_of(field)
 
 
 @pytest.mark.parametrize(
@@ -187,7 +231,7 @@ def test_frequencies_in_radians_are_told(hertz, told):
     G = np.array([123e3 + 27e3j, 129e3 + 29e3j])[:, None]
     own = SimpleNamespace(waves=SimpleNamespace(omega=2 * np.pi * np.array(hertz)), density=DENSITY)
     found = SimpleNamespace(whole=SimpleNamespace(modulus=G, standard_errors=0.01 * np.abs(G) * (1 + 1j)))
-    said = cautions._of_scales(own, found)
+    said = cautions._of_scales(own, found, [0, 1])
     assert [s.startswith("the frequencies") and "if the given numbers are in rad/s" in s for s in said] == [True] * told
 
 

@@ -60,15 +60,19 @@ def body_of(field: WaveField, side: int | None = None) -> VoxelBody:
     The body is divided into parts of at most `side` bricks along each axis. If `side` is None, the body is not divided.
 
     Raises:
-        InputError: there are too few such voxels, or the displacements have fewer than three components.
+        InputError: there are too few such voxels, no voxel is measured at all frequencies, or the displacements have
+            fewer than three components.
     """
-    measured = np.all(np.isfinite(field.displacement), axis=0)
-    if not np.any(np.all(measured, axis=-1)):
-        raise InputError(
-            f"{field.source or 'waves'}: the balance of forces needs three components of the displacement; measure all "
-            "three"
-        )
-    return voxels.voxel_body(field.mask & np.all(measured, axis=-1), field.spacing, field.origin, side)
+    measured = field.mask & np.all(np.isfinite(field.displacement), axis=-1)  # (F, nx, ny, nz)
+    always = np.all(measured, axis=0)
+    if not np.any(always):
+        name = field.source or "waves"
+        if np.all(np.any(measured, axis=(1, 2, 3))):
+            raise InputError(
+                f"{name}: no voxel is measured at all frequencies; fit each frequency separately, from its own file"
+            )
+        raise InputError(f"{name}: the balance of forces needs three components of the displacement; measure all three")
+    return voxels.voxel_body(always, field.spacing, field.origin, side)
 
 
 #: Maximum numbers of bricks along the side of a part, which are tried in this order. The factorisation of larger parts
@@ -172,7 +176,8 @@ def regions_of(
     def of_parts() -> Regions:
         moved = edge_places.moved_edges(labels, body, known) if len(known) > 1 else None
         matrices = edges.region_matrices(m, body, organ.density, edge_places.places(labels, body, known), moved)
-        start = np.full(len(known), whole.modulus[0, 0])
+        found = np.where(whole.converged, whole.modulus[:, 0], m.typical * (1 + regions.LOSS * 1j))
+        start = np.repeat(found[:, None], len(known), axis=1)
         return regions.moduli_of_regions(matrices, waves, start, progress, body.voxel)
 
     parts = keep("parts", of_parts)

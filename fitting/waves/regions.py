@@ -64,7 +64,9 @@ class Regions(NamedTuple):
         """Standard errors (F, R) [Pa] of the moduli. Real part: storage modulus; imaginary part: loss modulus."""
         R = self.modulus.shape[1]
         sd = np.tile(self.noise_factor, 2) * np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
-        return sd[:, :R] + 1j * sd[:, R:]
+        errors = np.empty(self.modulus.shape, complex)
+        errors.real, errors.imag = sd[:, :R], sd[:, R:]  # the sum sd + 1j * sd would be NaN if sd is infinite
+        return errors
 
 
 class _State(NamedTuple):
@@ -124,17 +126,20 @@ def moduli_of_regions(
     Args:
         m: matrices from `edges.region_matrices`.
         waves: the measured waves.
-        start: starting point of the search at the lowest frequency: the complex modulus of each region (R,) [Pa]. The
-            search at each other frequency starts from the moduli of the frequency before.
+        start: starting point of the search: the complex modulus of each region [Pa], (R,), or (F, R) with own moduli
+            for each frequency. If the search converged at a lower frequency, it starts from the moduli that were found
+            there (at the nearest such frequency). If it does not converge from there, it starts again from `start`.
         progress: function that is called after every iteration, with its number and chi^2 per equation.
         voxel: voxel index of each node (V, 3), needed to estimate the correlation of the noise. If it is None, the
             noise is assumed to be white.
     """
-    found, G, correlations = [], np.asarray(start, complex), []
-    for f in range(len(waves.omega)):
-        *one, now = _one_frequency(m, waves, f, G, progress)
+    found, before, correlations = [], None, []
+    for f, own in enumerate(np.broadcast_to(start, (len(waves.omega), np.shape(start)[-1])).astype(complex)):
+        *one, now = _one_frequency(m, waves, f, own if before is None else before, progress)
+        if before is not None and not one[-1]:
+            *one, now = _one_frequency(m, waves, f, own, progress)
         found.append(one)
-        G = one[0]
+        before = one[0] if one[-1] else before
         if voxel is not None:
             C = m.rows(now.G, waves.omega[f])
             given = m.by_moduli(now.here.motion), waves.motion[f], waves.sd[f], voxel

@@ -54,7 +54,7 @@ def read_waves(
     Raises:
         InputError: the file cannot be used; the message states the file, the field, the value and what to do.
     """
-    name, found = str(path), formats.arrays(Path(path))
+    name, found, unit = str(path), formats.arrays(Path(path)), formats.with_micro_sign(unit or "")
     more = {"mask": mask, "labels": labels}
     if spacing is None and formats.CONFLICT in found:
         raise InputError(f"{found[formats.CONFLICT]}, or give --spacing")

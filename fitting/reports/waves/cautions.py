@@ -33,7 +33,9 @@ def cautions_of_elastography(organ: Organ, found: Found, drawn: WaveMap | None) 
     """Return all warnings about a fit to waves. The arguments are the same as for
     `fitting.reports.waves.report.write`."""
     told, each = _sign(organ, found), found.whole if found.parts is None else found.parts
-    told += _of_scales(organ, found)
+    noise = organ.field.noise
+    moves = [f for f in range(len(noise)) if np.isfinite(noise[f]) and not _of_no_motion(organ.field, f)]
+    told += _of_scales(organ, found, moves)
     any_coarse = False
     order = components.order_sentence(organ.field)
     if order is not None:
@@ -49,21 +51,7 @@ def cautions_of_elastography(organ: Organ, found: Found, drawn: WaveMap | None) 
         told += coarse + _of_residuals(hertz, each, f, "regions" if found.parts else "moduli", bool(coarse))
         any_coarse |= bool(coarse)
         told += _of_stopped_search(hertz, found, f) + (_of_long_waves(hertz, found, f) if each.converged[f] else [])
-    if found.parts is not None and found.labels is not None:
-        few = ~(found.parts.standard_errors.real < np.abs(found.parts.modulus)).all(axis=0)
-        for label in found.labels[few]:
-            told.append(
-                f"region {label}: the standard error of its modulus exceeds this modulus, because the region has too "
-                "few voxels"
-            )
-        told += _of_small_regions(organ.field, found.labels[~few])
-        far = np.abs(found.parts.farther).max(axis=0) > 1
-        if far.any():
-            names = ", ".join(str(label) for label, beyond in zip(found.labels, far, strict=True) if beyond)
-            told.append(
-                f"regions {names}: from the waves, the edges of these regions are more than a voxel away from the "
-                "edges of the labels (edges_farther_out_voxels): check the labels"
-            )
+    told += _of_sizes_and_edges(organ.field, found, moves)
     if drawn is not None and not drawn.distance <= FAR:
         told.append(
             f"the search for the map stopped {drawn.distance:.2g} standard deviations from the minimum: compare the "
@@ -84,6 +72,29 @@ def cautions_of_elastography(organ: Organ, found: Found, drawn: WaveMap | None) 
             "are sharper than in the map, noise that is larger in a part of the organ, a ratio of the moduli at "
             "several frequencies that is not the same everywhere, or a body that does not move like a viscous solid. "
             "Compare the map with the moduli of regions, and with the map from one frequency alone"
+        )
+    return told
+
+
+def _of_sizes_and_edges(field: WaveField, found: Found, moves: list[int]) -> list[str]:
+    """Return warnings about regions that are too small, and about edges that are not those of the labels.
+
+    `moves`: numbers of the frequencies with motion. The others contain only noise and say nothing about a region.
+    """
+    if found.parts is None or found.labels is None:
+        return []
+    few = ~(found.parts.standard_errors.real < np.abs(found.parts.modulus))[moves].all(axis=0)
+    told = [
+        f"region {label}: the standard error of its modulus exceeds this modulus, because the region has too few voxels"
+        for label in found.labels[few]
+    ]
+    told += _of_small_regions(field, found.labels[~few])
+    far = np.abs(found.parts.farther[moves]).max(axis=0, initial=0.0) > 1
+    if far.any():
+        names = ", ".join(str(label) for label, beyond in zip(found.labels, far, strict=True) if beyond)
+        told.append(
+            f"regions {names}: from the waves, the edges of these regions are more than a voxel away from the edges of "
+            "the labels (edges_farther_out_voxels): check the labels"
         )
     return told
 
@@ -183,7 +194,7 @@ def _of_voxel_size(hertz: float, found: Found, f: int) -> list[str]:
     if found.parts is not None and found.parts_bias is not None:
         each, biases = found.parts, found.parts_bias
     bias, error = np.abs(biases[f]), each.standard_errors[f].real / np.abs(each.modulus[f])
-    r = int(np.argmax(bias / np.maximum(error, 1e-12)))
+    r = int(np.argmax(np.nan_to_num(bias / np.maximum(error, 1e-12))))
     if not bias[r] > error[r]:
         return []
     return [
@@ -252,14 +263,17 @@ def _in_radians(hertz: np.ndarray) -> bool:
     return bool(np.all(whole(hertz / (2 * np.pi)) & ~whole(hertz)))
 
 
-def _of_scales(organ: Organ, found: Found) -> list[str]:
+def _of_scales(organ: Organ, found: Found, moves: list[int]) -> list[str]:
     """Return warnings about wave speeds outside the range of soft tissue, and about moduli that change with frequency
     as in no material.
 
-    The balance of forces does not depend on the units, so chi^2 does not show a wrong unit.
+    The balance of forces does not depend on the units, so chi^2 does not show a wrong unit. `moves`: numbers of the
+    frequencies with motion. The moduli at other frequencies are those of noise, so they are not checked.
     """
-    told, omega = [], organ.waves.omega
-    G, errors = found.whole.modulus[:, 0], np.abs(found.whole.standard_errors[:, 0])
+    if not moves:
+        return []
+    told, omega = [], organ.waves.omega[moves]
+    G, errors = found.whole.modulus[moves, 0], np.abs(found.whole.standard_errors[moves, 0])
     speeds = velocity_and_attenuation(G.real, G.imag, omega, organ.density)[0]
     odd = np.flatnonzero(~((speeds > SLOW) & (speeds < FAST)))
     if odd.size:

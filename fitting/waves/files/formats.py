@@ -91,9 +91,8 @@ def single(path: Path, name: str, spacing_given: bool = False) -> tuple[np.ndarr
     if CONFLICT in found and not spacing_given:
         raise InputError(found[CONFLICT])
     place = (None, None) if CONFLICT in found else (found.get("spacing"), found.get(PLACE))
-    if name in found:
-        return np.asarray(found[name]), *place
-    own = [v for k, v in found.items() if k in ("displacement", "mask", "labels") and v is not None]
+    names = (name,) if name in found else ("displacement", "mask", "labels")
+    own = [found[k] for k in names if found.get(k) is not None]
     if len(own) != 1:
         raise InputError(
             f"{path}: no array of the file has the name {name}; give this name to the array that contains the {name}"
@@ -147,7 +146,12 @@ def _with_plain_unit(found: Content) -> Content:
     if found.get("unit") is None:
         return found
     word = np.ravel(found["unit"])[0] if np.size(found["unit"]) else ""
-    return found | {"unit": (word.decode() if isinstance(word, bytes) else str(word)).strip()}
+    return found | {"unit": with_micro_sign((word.decode() if isinstance(word, bytes) else str(word)).strip())}
+
+
+def with_micro_sign(unit: str) -> str:
+    """Return a unit with the micro sign (U+00B5) in place of the Greek letter (U+03BC), which looks the same."""
+    return unit.replace("\u03bc", "\u00b5")
 
 
 def _hdf5(path: Path) -> Content:
