@@ -169,6 +169,37 @@ def test_rows_of_a_contact_that_shrinks_are_left_out(tmp_path, shape, back):
         assert test.time[-1] == pytest.approx(4.7)
 
 
+@pytest.mark.parametrize("shape", ["sphere", "punch"])
+def test_an_approach_that_is_longer_than_the_indentation_is_left_out(tmp_path, shape):
+    """The approach was taken as the load. So the sphere was refused, and the modulus of the punch was 1 Pa. After a
+    short approach, a note told that the first row was under load."""
+    layer = thin_layer.Layer(thin_layer.Indenter(shape, 2e-3, 0.5, 1e-3))
+    time, rng = np.arange(0, 60, 0.2), np.random.default_rng(1)
+    for approach in (1e-3, 1.5e-4):
+        d = np.interp(time, [0, 10, 12, 60], [-approach, 0, 2e-4, 2e-4])
+        elastic = 800 * 3 * layer.force(np.maximum(d, 0))
+        force = elastic + 0.002 * elastic.max() * rng.standard_normal(len(time))
+        for sign in (1, -1):
+            columns = (time, sign * d, sign * force)
+            test = read_described(written(tmp_path, {"test": shape, "thickness": 2e-3, "radius": 1e-3}, columns))
+            assert test.begun == pytest.approx(10.0) and not any("under load already" in n for n in test.notes)
+            held = test.used & (test.time > 13)
+            assert np.mean(test.answer[held] / test.driven[held]) == pytest.approx(800, rel=0.002)
+
+
+@pytest.mark.parametrize("offset", [0.0, 2e-4])
+def test_rows_after_a_punch_is_lifted_are_left_out(tmp_path, offset):
+    """The force of a punch that no longer touched the sample was fitted, and G0 was four times too large."""
+    time = np.arange(0, 40, 0.1)
+    d = np.interp(time, [0, 1, 2, 31, 31.5, 40], [0, 0, 1e-4, 1e-4, 0, 0])
+    force = 80 * d * (0.4 + 0.6 * np.exp(-time / 10))
+    force[time > 31.15] = 0.0
+    force += offset + 1e-5 * np.random.default_rng(0).standard_normal(len(time))
+    table = {"test": "punch", "thickness": 2e-3, "radius": 1e-3}
+    test = read_described(written(tmp_path, table, (time, d, force)))
+    assert test.time[-1] == pytest.approx(31.1) and any("88 rows from 31.2 s on are ignored" in n for n in test.notes)
+
+
 @pytest.mark.parametrize(("rows", "noise"), [(301, 0.005), (1501, 0.01)])
 @pytest.mark.parametrize("back", [0.0, 0.05])
 def test_the_scatter_of_a_held_sphere_is_no_retraction(tmp_path, rows, noise, back):

@@ -7,7 +7,7 @@ from conftest import SHARED
 from fitting.__main__ import main
 from fitting.fits import viscoelastic
 from fitting.master import master_curve
-from fitting.methods import generalised_maxwell
+from fitting.methods import generalised_maxwell, time_response
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.frequency_sweep import Sweep
 from fitting.readers.time_tests import TimeTest
@@ -138,6 +138,22 @@ def test_the_error_of_a_noisy_test_is_its_noise():
         assert f"{1 / factor:.3g} times the prediction would fit" in prediction.sentence(wrong)
     tail = found._replace(sizes=np.full(len(found.sizes), np.inf))
     assert "in the band have decayed into the noise" in prediction.sentence(tail)
+
+
+def test_cycles_and_later_steps_are_in_the_band_of_the_sweep():
+    """Times were counted from the first load. So the values of a cyclic test after 20 s did not count, although the
+    sweep contained its frequency, and their stress was 1.3 times too large without a sign of it."""
+    time, fit, s = np.arange(0, 60, 0.04), viscoelastic.closed_form(sweep(0.0, 0), 2), sweep(0.0, 0)
+    strain = 1 - np.cos(2 * np.pi * time)
+    stress = np.asarray(time_response.stress_response(TRUTH, time, strain)) * np.where(time > 25, 1.3, 1.0)
+    cycles = TimeTest("relaxation", time, strain, stress, time > 0, source="cycles.csv")
+    found = prediction.predict(fit, s.resolved, cycles)
+    assert found.inside.all() and found.factor > 1.03 and "not counted" not in prediction.sentence(found)
+    time = np.concatenate([[0.0], np.arange(1, 51), 50 + np.geomspace(0.005, 5, 20)])
+    twice = TimeTest("relaxation", time, 1.0 * (time > 0) + (time > 50), 1 + time, time > 0)
+    place = np.concatenate([np.arange(1, 51), np.geomspace(0.005, 5, 20)])
+    inside = prediction.predict(fit, s.resolved, twice).inside
+    assert np.array_equal(inside, (place >= 0.01) & (place <= 20))
 
 
 def test_decayed_values_are_not_in_the_percentage():

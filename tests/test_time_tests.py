@@ -15,7 +15,7 @@ from fitting.fits import time_tests as fits
 from fitting.methods import time_response, uncertainty
 from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import Maxwell
-from fitting.readers.time_tests import TimeTest, read_time_test
+from fitting.readers.time_tests import TimeTest, kind_of, read_time_test
 from liverjax import InputError
 
 pytestmark = pytest.mark.quick_to_compile
@@ -55,6 +55,45 @@ def test_creep_and_relaxation_are_of_one_material(model):
             epsrel=1e-9,
         )[0]
         assert np.isclose(product, t, rtol=1e-7)
+
+
+def test_times_are_counted_from_the_last_change_of_the_load():
+    """They were counted from the first load. So steady cycles from 32 to 40 s resolved no time below 32 s, and a
+    second step with rows from 5 ms on resolved no time below 1 s."""
+
+    def resolved(time, load, start=0.0):
+        test = TimeTest("relaxation", time, load, load, (time > 0) & (time >= start))
+        return (*test.resolved, test.answers_at_once)
+
+    cycles = np.arange(0, 40, 0.04)
+    found = resolved(cycles, 1 - np.cos(2 * np.pi * cycles), 32)
+    assert found == (pytest.approx(0.04), pytest.approx(39.96), False)
+    time = np.concatenate([np.arange(0, 101.0), 100 + np.geomspace(0.005, 100, 100)])
+    assert resolved(time, 1.0 * (time > 0) + (time > 100)) == (pytest.approx(0.005), 200, False)
+    # A response at the instant of a later step resolves no time.
+    time = np.array([0, 1, 2, 3, 10, 10.00001, 11, 13, 20])
+    assert resolved(time, 1.0 * (time > 0) + (time > 10), 5) == (pytest.approx(1.0), 20, True)
+    # A single ramp is one change, whether it is straight or smooth, and whether it scatters or not.
+    time = np.append(0, np.geomspace(0.01, 100, 200))
+    straight, rng = np.minimum(time / 2, 1), np.random.default_rng(0)
+    for ramp in (straight, straight**2, 0.5 - 0.5 * np.cos(np.pi * straight), straight + 0.01 * rng.normal(size=201)):
+        test = TimeTest("relaxation", time, ramp, ramp, time >= 20)
+        assert test.resolved == (time[test.used][0] - test.begun, 100 - test.begun)
+
+
+@pytest.mark.parametrize("kind", ["relaxation", "creep"])
+def test_the_imposed_column_is_found_in_a_test_with_recovery(tmp_path, kind):
+    """Creep with recovery was read as relaxation, because the stress changed more in the second half."""
+    time, rng = np.append(0, np.arange(0.1, 100, 0.25)), np.random.default_rng(0)
+    square = np.interp(time, [0, 0.1, 60, 60.1], [0, 1, 1, 0])
+    for load in (square, np.abs((time / 20 + 1) % 2 - 1), np.minimum(time, 1)):
+        respond = time_response.stress_response if kind == "relaxation" else time_response.strain_response
+        answer = np.asarray(respond(SOLID, time, load))
+        answer = answer + 0.02 * np.abs(answer).max() * rng.standard_normal(len(time))
+        pair = (load, answer) if kind == "relaxation" else (answer, load)
+        rows = np.column_stack([time, *pair])
+        np.savetxt(tmp_path / "t.csv", rows, delimiter=",", header="time_s,strain_1,stress_Pa", comments="")
+        assert kind_of(tmp_path / "t.csv") == kind
 
 
 def test_creep_of_one_mode_is_the_textbook_one():

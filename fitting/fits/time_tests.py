@@ -314,11 +314,11 @@ def response_in_time(kind: str, model: Maxwell, at: Array, *drive: Array) -> Arr
 
 def apparent(test: TimeTest) -> tuple[np.ndarray, np.ndarray]:
     """Return the stress divided by the strain (m,) [Pa] at the m measured values, which is roughly the relaxation
-    modulus G(t). Also return the times (m,) [s] of these values since the loading began."""
+    modulus G(t). Also return the times (m,) [s] of these values since the last change of the load."""
     rows = thinned(test)
     driven, answer = np.abs(test.driven[rows]), np.maximum(np.abs(test.answer[rows]), 1e-3 * _scales(test, rows))
     ratio = answer / np.maximum(driven, 1e-6 * driven.max())
-    return ratio if test.kind == "relaxation" else 1 / ratio, test.time[rows] - test.begun
+    return ratio if test.kind == "relaxation" else 1 / ratio, test.since_change[rows]
 
 
 def apparent_equations(test: TimeTest, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

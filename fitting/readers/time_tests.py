@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fitting.readers.base_line import OFFSET, RESTING, base_line
+from fitting.readers.changes_of_load import begins_of_changes, first_is_imposed
 from fitting.readers.checks.course_in_time import BEYOND_NOISE, another_course, of_ringing, of_the_other_kind
 from fitting.readers.checks.scattering_load import without_scatter
 from fitting.readers.noise_of_series import (
@@ -111,15 +112,21 @@ class TimeTest(NamedTuple):
     def answers_at_once(self) -> bool:
         """Whether a response at the instant of a step is fitted. Such a response determines G0, but no relaxation
         time."""
-        first, second = self.time[self.used][:2] - self.begun
-        return bool(first < AT_ONCE * second)
+        return bool(_at_once(self.since_change[self.used]).any())
+
+    @property
+    def since_change(self) -> np.ndarray:
+        """Times (n,) [s] since the load last began to change or changed its direction. A row at this instant belongs
+        to the load before."""
+        begins = begins_of_changes(self.time, self.driven, self.begun)
+        return self.time - begins[np.maximum(np.searchsorted(begins, self.time) - 1, 0)]
 
     @property
     def resolved(self) -> tuple[float, float]:
-        """Shortest and longest relaxation time [s] that the test resolves: the times of the first and the last fitted
-        response, counted from the start of the load."""
-        time = self.time[self.used] - self.begun
-        return float(time[int(self.answers_at_once)]), float(time[-1])
+        """Shortest and longest relaxation time [s] that the test resolves: the shortest time of a fitted response since
+        a change of the load (`since_change`), and the time from the start of the load to the last fitted response."""
+        since = self.since_change[self.used]
+        return float(since[~_at_once(since)].min()), float(self.time[self.used][-1] - self.begun)
 
 
 class Sample(NamedTuple):
@@ -310,6 +317,13 @@ def _rows_of_jumps(time: np.ndarray, driven: np.ndarray) -> np.ndarray:
     return 1 + np.flatnonzero((own > least) & alone)
 
 
+def _at_once(since: np.ndarray) -> np.ndarray:
+    """Return whether each response (n,) is at the instant of a step. `since`: times (n,) [s] since the last change of
+    the load."""
+    first = np.diff(since, prepend=np.inf) <= 0  # the first response after a change
+    return first & (since < AT_ONCE * np.append(since[1:], 0.0))
+
+
 def rows_before_jumps(rows: np.ndarray, ramp: float, time: np.ndarray, *columns: np.ndarray) -> tuple:
     """Return the columns with an added row in each jump, `ramp` [s] before the later row of the jump. The added row has
     the values of the earlier row."""
@@ -325,14 +339,12 @@ def rows_before_jumps(rows: np.ndarray, ramp: float, time: np.ndarray, *columns:
 
 def kind_of(path: str | os.PathLike) -> str:
     """Return "relaxation" or "creep". A column of modulus means relaxation, and a column of compliance means creep.
-    Otherwise, the column that changes less in the second half is the imposed quantity."""
+    Otherwise, `first_is_imposed` finds the imposed quantity."""
     columns, _ = read_columns(path)
     form = next((f for f in FORMS if set(f) <= set(columns)), ("modulus",))
     if len(form) == 1:
         return "relaxation" if form == ("modulus",) else "creep"
-    late = len(columns["time"]) // 2
-    moves = [np.ptp(columns[q][late:]) / max(float(np.max(np.abs(columns[q]))), 1e-300) for q in form]
-    return "relaxation" if moves[0] <= moves[1] else "creep"
+    return "relaxation" if first_is_imposed(columns["time"], columns[form[0]], columns[form[1]]) else "creep"
 
 
 def _own_table(kind: str) -> str:

@@ -83,7 +83,7 @@ def predict(fit: Fit, resolved: tuple[float, float], test: Measured) -> Predicti
         errors = np.linalg.norm(slopes @ fit.uncertainty.root, axis=1)
     low, high = resolved
     if isinstance(test, TimeTest):
-        place = np.asarray(at[0])[np.asarray(at[2])] - test.begun
+        place = test.since_change[time_tests.thinned(test)]
     else:
         omega = np.asarray(at[0])
         place = np.tile(1 / omega, len(measured) // len(omega))

@@ -22,10 +22,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.ndimage
 
+from fitting.readers.checks.course_in_time import BEYOND_NOISE
 from fitting.readers.checks.scattering_load import without_scatter
 from fitting.readers.noise_of_series import noise_of_series
 from fitting.readers.tables.time_columns import read_columns
-from fitting.readers.time_tests import TimeTest, from_rest, of_columns, with_known_rise
+from fitting.readers.time_tests import AT_REST, TimeTest, from_rest, of_columns, with_known_rise
 from fitting.rigs import glued, thin_layer
 from fitting.rigs.compression import smooth_force
 from liverjax.core.bounds import finite
@@ -62,6 +63,11 @@ _BACK = 0.02
 _ROWS, _FALL, _FALL_WIDE = 5, 1.5, 3.0
 #: The median over more rows covers at most the fraction _WIDE of the rows, and at most _WIDEST rows.
 _WIDE, _WIDEST = 0.05, 500
+#: A punch that goes back has lost the contact if its force is below AT_REST times the largest force, or below
+#: _NO_FORCE standard deviations of the noise of the force.
+_NO_FORCE = 3.0
+#: Rows in which the force exceeds this fraction of the largest force show the direction of an indentation.
+_PRESSED = 0.5
 #: Minimum number of rows in which the contact grows, including the row at rest.
 _FEWEST = 6
 #: Maximum number of rows of an indenter's test, including the rows that are added between the measured rows.
@@ -120,7 +126,7 @@ def read_described(path: str | Path) -> TimeTest:
     d, force = columns["displacement"], columns["force"]
     if described.test == "compression":
         notes.append("displacement and force are assumed to be positive in compression")
-    sign = np.sign(d[np.argmax(np.abs(d))]) or 1.0
+    sign = _sign_of_load(described, d, force)
     if described.test == "tension" and sign < 0:
         notes.append(
             "the displacement is negative, and is taken as the length by which the sample is pulled. If the sample was "
@@ -130,6 +136,8 @@ def read_described(path: str | Path) -> TimeTest:
     if not largest > 0:
         raise InputError(f"{described.data}: the displacement is zero throughout; give a test with a displacement")
     curve, size, told = _elastic(described, (largest, float(np.max(-sign * d))), str(path))
+    if "thickness" in described.sizes and described.drive == "displacement":
+        d = _from_contact(d, sign, largest)
     section = curve(largest * 1e-3) / (1e-3 * largest / size)
     if described.test in ("sphere", "cone"):
         section = curve(largest) / (largest / size)
@@ -148,11 +156,29 @@ def read_described(path: str | Path) -> TimeTest:
     return with_known_rise(test, own_time, own_drive, ramp)._replace(described=True, per_size=per_size)
 
 
+def _sign_of_load(described: Described, d: np.ndarray, force: np.ndarray) -> float:
+    """Return the sign (1 or -1) of the displacement d (n,) that loads the sample. Before the contact, an indenter may
+    move further than it moves in the sample. So only the rows with a large force count for an indenter."""
+    size = np.abs(force)
+    pressed = float(np.median(d[size >= _PRESSED * size.max()])) if "thickness" in described.sizes else 0.0
+    return float(np.sign(pressed or d[np.argmax(np.abs(d))])) or 1.0
+
+
+def _from_contact(d: np.ndarray, sign: float, largest: float) -> np.ndarray:
+    """Return the displacements d (n,) of an indenter with 0 in the rows before contact. The scatter of d around 0 is no
+    approach and is not changed, because its mean without the negative values would not be 0."""
+    approach = -float(np.min(sign * d))
+    if approach <= max(AT_REST * largest, BEYOND_NOISE * noise_of_series(d)):
+        return d
+    return sign * np.maximum(sign * d, 0.0)
+
+
 def _rows_to_fit(
     described: Described, rows: tuple[np.ndarray, np.ndarray, np.ndarray], sign: float
 ) -> tuple[tuple[np.ndarray, ...], list[str]]:
     """Return time, displacement and force of the rows that are fitted, and notes. The imposed quantity has no scatter.
-    For sphere and cone, rows are left out after the indenter goes back, and rows are added between the others.
+    For sphere and cone, rows are left out after the indenter goes back, and rows are added between the others. For a
+    punch, rows are left out after it loses the contact.
 
     Args:
         described: the description of the test.
@@ -167,12 +193,16 @@ def _rows_to_fit(
     notes: list[str] = []
     if described.test in ("sphere", "cone"):
         kept, notes = _while_contact_grows(time, sign * (first if by_displacement else then))
-        if kept < min(_FEWEST, len(time)):
-            raise InputError(
-                f"{described.data}: the indenter goes back from {time[kept]:.4g} s on, after {kept} rows; give a test "
-                "that begins with an indentation"
-            )
-        time, first, then = time[:kept], first[:kept], then[:kept]
+    elif described.test == "punch" and by_displacement:
+        kept, notes = _while_punch_presses(time, sign * first, sign * then)
+    else:
+        kept = len(time)
+    if kept < min(_FEWEST, len(time)):
+        raise InputError(
+            f"{described.data}: the indenter goes back from {time[kept]:.4g} s on, after {kept} rows; give a test "
+            "that begins with an indentation"
+        )
+    time, first, then = time[:kept], first[:kept], then[:kept]
     # The added rows lie on straight lines. Among them, the scatter of the measured rows would not be found.
     first, told = without_scatter(time, first, described.drive)
     d, force = (first, then) if by_displacement else (then, first)
@@ -184,6 +214,34 @@ def _rows_to_fit(
 def _while_contact_grows(time: np.ndarray, depth: np.ndarray) -> tuple[int, list[str]]:
     """Return the number of rows before the indenter goes back, and a note if it goes back. While the contact shrinks,
     another formula is valid for the force (Ting 1966, J. Appl. Mech. 33:845)."""
+    back = _gone_back(depth)
+    if not back.any():
+        return len(time), []
+    kept = int(np.argmax(back))
+    return kept, [
+        f"{len(time) - kept} rows from {time[kept]:.4g} s on are ignored, because the indenter goes back there, and "
+        "the formulas are not valid while the contact shrinks"
+    ]
+
+
+def _while_punch_presses(time: np.ndarray, depth: np.ndarray, force: np.ndarray) -> tuple[int, list[str]]:
+    """Return the number of rows before a punch loses the contact, and a note if it loses the contact: it goes back, and
+    its force falls to 0. While a punch presses on the sample, its contact does not shrink, so it may go back."""
+    loaded = int(np.argmax(depth > AT_REST * depth.max()))
+    smooth = scipy.ndimage.median_filter(force, _ROWS, mode="nearest")  # removes single low values
+    smooth -= np.median(force[:loaded]) if loaded >= _ROWS else 0.0  # the sensor may have an offset
+    free = _gone_back(depth) & (smooth <= max(AT_REST * smooth.max(), _NO_FORCE * noise_of_series(force)))
+    if not free.any():
+        return len(time), []
+    kept = int(np.argmax(free))
+    return kept, [
+        f"{len(time) - kept} rows from {time[kept]:.4g} s on are ignored, because the punch goes back and has no force "
+        "there: it does not touch the sample any more"
+    ]
+
+
+def _gone_back(depth: np.ndarray) -> np.ndarray:
+    """Return whether the indenter has gone back from its largest depth before each row (n,)."""
     depth = np.maximum(depth, 0.0)
     # The largest of n values with Gaussian noise is expected at sqrt(2 ln(n)) standard deviations.
     deviation = noise_of_series(depth) * np.sqrt(2 * np.log(len(depth)))
@@ -195,13 +253,7 @@ def _while_contact_grows(time: np.ndarray, depth: np.ndarray) -> tuple[int, list
     rows = int(np.clip(needed, _ROWS, max(_ROWS, min(_WIDE * len(depth), _WIDEST)))) | 1  # an odd number
     smooth = scipy.ndimage.median_filter(depth, rows, mode="reflect")
     back |= np.maximum.accumulate(smooth) - smooth > max(least, _FALL_WIDE * deviation / np.sqrt(rows))
-    if not back.any():
-        return len(time), []
-    kept = int(np.argmax(back))
-    return kept, [
-        f"{len(time) - kept} rows from {time[kept]:.4g} s on are ignored, because the indenter goes back there, and "
-        "the formulas are not valid while the contact shrinks"
-    ]
+    return back
 
 
 def _with_more_between(time: np.ndarray, d: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, ...]:
