@@ -7,6 +7,7 @@ import pytest
 
 import liverjax as lj
 from fitting.__main__ import main
+from fitting.commands import field as field_command
 from fitting.fits import field, inclusion
 from fitting.methods.estimate import Estimate, bias_sentences
 from fitting.reports import field_report
@@ -55,6 +56,36 @@ def test_the_warnings_about_a_map_are_in_its_content():
         content["warnings"], ("chi2 stays at", "the search stopped", "level of the map", "mesh"), strict=True
     ):
         assert words in said
+
+
+def test_nodes_without_a_map_do_not_count():
+    """The report gave 50 % as the largest bias, at a node where a region sets the parameter. A small standard deviation
+    at this node hid that the level was open."""
+    mesh = lj.shapes.box((2.0, 1.0, 1.0), (2, 1, 1))
+    given = np.arange(mesh.number_of_elements) < mesh.number_of_elements // 2
+    nodes = mesh.element_nodes_on_host
+    lost = np.isin(np.arange(mesh.number_of_nodes), np.setdiff1d(nodes[:, given], nodes[:, ~given]))
+    assert lost.sum() == 4
+    sd, bias, m = np.where(lost, 0.01, 0.6), np.where(lost, 0.5, 0.1), np.zeros(len(lost))
+    found = field.Field(
+        *("law.mu", m, np.ones(len(given)), sd, m + 1, bias, bias, 0.1, 0.02, 240.0, 240, True, 0.0),
+        *([], np.ones(3), (0,), 1.0, given, 0.1),
+    )
+    content = field_report.of_field(mesh, found)
+    assert content["largest_mesh_bias_of_ln"] == content["largest_time_step_bias_of_ln"] == 0.1
+    (said,) = content["warnings"]
+    assert said.startswith("the data do not determine the level of the map: at every node")
+
+
+def test_a_uniform_map_gives_no_sphere(capsys):
+    """The start was NaN, and the message was that the fit diverged."""
+    mesh = lj.shapes.box((1.0, 1.0, 1.0), (1, 1, 1))
+    problem = SimpleNamespace(scenes=(SimpleNamespace(mesh=mesh),))
+    found = SimpleNamespace(name="law.mu", log_factor=np.zeros(8), sd=np.full(8, 0.1))
+    with pytest.raises(lj.InputError, match=r"the map of law.mu is uniform, so no sphere can be placed"):
+        inclusion.start_from(problem, found)
+    content, converged = field_command._sphere(problem, found, False)  # the command still writes the map
+    assert not converged and capsys.readouterr().err == f"warning: {content['warnings'][0]}\n"
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from liverjax.physics.attached.ligament import Ligament
 from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.physics.porosity import Inlet
 from liverjax.physics.prescribed import free_degrees
+from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene_file import scene_from
 from liverjax.scenes.springpots import springpot_factors
 from liverjax.simulation.equations import forces_at
@@ -262,3 +263,30 @@ def test_a_body_on_an_obstacle_has_rested():
     assert waves._of_rest(scene, x, 0.9 * reactions, "--about run")
     sliding = replace(scene, fixed=(lj.Fixed(nodes=mesh.node_sets["x_min"], axes="x"),))
     assert waves._of_rest(sliding, x, reactions * np.array([1.0, 0.0, 0.0]), "--about run") == []
+
+
+def test_a_loaded_mesh_is_unloaded_before_harmonic_motion():
+    """lj.harmonic advised to call lj.unloaded, which refused every scene with harmonic motion. The traction is an
+    amplitude, so it does not act in the given shape."""
+    table = {
+        "mesh": {"shape": "box", "size": [0.04, 0.01, 0.01], "cells": [2, 1, 1], "is": "loaded"},
+        "law": {"name": "neo_hookean", "mu": 800.0, "bulk": 4000.0},
+        "springpots": {"times": [0.01], "exponents": [0.3], "spring": 0.8},
+        "body": {"density": 1000.0, "gravity": [0, 0, -1.0]},
+        "fixed": [{"where": {"x_max": 0.0}}],
+        "traction": [{"where": {"x_min": 0.04}, "value": [0, 0, 1.0]}],
+        "solve": {"kind": "harmonic", "frequencies": [5.0], "tolerance": 1e-10},
+    }
+    scene = scene_from(table)
+    with pytest.raises(lj.InputError, match=r"use the scene of lj.unloaded\(scene\)"):
+        lj.harmonic(scene)
+    found = lj.unloaded(scene)
+    given, points = np.asarray(scene.mesh.points), np.asarray(found.scene.mesh.points)
+    assert np.abs(points - given).max() > 1e-3  # [m]
+    assert found.scene.solve.kind == "harmonic" and len(found.scene.traction) == 1
+    still = resting(by_element(replace(found.scene, traction=())))
+    still = prepared(replace(still, solve=replace(still.solve, dt=None, frequencies=None)))
+    force, whole = (np.asarray(jax.jit(forces_at)(still, x))[given[:, 0] > 0] for x in (given, points))
+    assert np.abs(force).max() < 1e-8 * np.abs(whole).max()
+    with pytest.raises(lj.InputError, match="kind = 'harmonic' has no time steps"):
+        lj.simulate(found.scene)

@@ -12,7 +12,7 @@ from liverjax.core.struct import replace
 from liverjax.jobs import long_run
 from liverjax.physics.attached.ligament import Ligament
 from liverjax.physics.elastic_support import ElasticSupport
-from liverjax.simulation import mesh_error
+from liverjax.simulation import mesh_error, run
 from liverjax.simulation.cautions.of_mesh import mesh_sentence
 
 pytestmark = pytest.mark.quick_to_compile
@@ -212,3 +212,35 @@ displaced = [{where = {z_min = 0.02}, by = [0.0, 0.0, 0.001]}]
     monkeypatch.setattr(mesh_error, "richer", refused)
     assert main(ask) == 0 and "caution: this mesh error is not known" in capsys.readouterr().out
     assert (out / "result.h5").exists()
+
+
+def test_the_mesh_error_of_a_loaded_mesh_is_refused(tmp_path, monkeypatch, capsys):
+    """The estimated error was 29 % of the length, although the run ends in the given shape on every mesh."""
+    from fitting.fits import scene_numbers
+    from fitting.readers.displacements import Displacements
+
+    text = """mesh = {shape = "box", size = [0.02, 0.02, 0.02], cells = [1, 1, 1], is = "loaded"}
+law = {name = "neo_hookean", mu = 800.0, bulk = 4000.0}
+body = {density = 1000.0, gravity = [0.0, 0.0, -1.0]}
+fixed = [{where = {x_max = 0.0}}]
+"""
+    file = tmp_path / "scene.toml"
+    file.write_text(text)
+    scene = lj.load_scene(file)
+    monkeypatch.setattr(run, "_run", lambda *_: pytest.fail("the scene must not run"))
+    monkeypatch.setattr(long_run, "run", lambda *_: pytest.fail("the scene must not run"))
+    with pytest.raises(lj.InputError, match="the mesh error is unknown, because the reference shape"):
+        lj.simulate(scene, mesh_error=True)
+    assert main(["simulate", str(file), "--mesh-error", "--out", str(tmp_path / "out")]) == 2
+    assert "the mesh error is unknown" in capsys.readouterr().err
+    data = Displacements(
+        step=np.array([0]),
+        nodes=np.full((1, 4), 7),
+        weights=np.array([[1.0, 0.0, 0.0, 0.0]]),
+        measured=np.zeros((1, 3)),
+        sd=np.full((1, 3), 1e-6),
+    )
+    problem = scene_numbers.Problem((scene,), (data,))
+    for finer in (None, lambda mesh: {}):
+        with pytest.warns(UserWarning, match=r"the effect of the mesh error on the fit is unknown: \[mesh\] is = "):
+            assert scene_numbers.discretisation_errors(problem, {}, finer).mesh is None

@@ -16,6 +16,7 @@ from fitting.reports import field_report
 from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.files import writable
+from liverjax.core.struct import Content
 from liverjax.scenes.scene import numbers_at
 from liverjax.scenes.scene_file import load_scene
 from liverjax.simulation import gradients
@@ -144,21 +145,32 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     kinds = dict.fromkeys(("mesh", *beside[0]))
     sizes = {f"{kind}_error_over_noise": [each.get(kind, np.nan) for each in beside] for kind in kinds}
     content = _files(options) | {"map": field_report.of_field(mesh, found) | sizes}
-    for sentence in field_report.map_sentences(found):
+    for sentence in field_report.map_sentences(mesh, found):
         _warn(sentence)
     if options.sphere:
-        sphere = inclusion.estimate(problem, name, inclusion.start_from(problem, found))
-        print(field_report.table_of_numbers(sphere))
         with_mesh = any(size > _TOLD for each in beside for size in each.values())
-        small = inclusion.size_sentence(mesh, sphere)
-        _warn(field_report.misfit_sentence(sphere, with_mesh))
-        _warn(small)
-        content["sphere"] = field_report.of_numbers(sphere, with_mesh)
-        content["sphere"]["warnings"] += [small] if small else []
-        good = good and sphere.converged
+        content["sphere"], converged = _sphere(problem, found, with_mesh)
+        good = good and converged
     field_report.write(options.out, mesh, content, found)
     print(f"written: {options.out}/field.json, field.vtu, field.h5, field.png")
     return 0 if good else 1
+
+
+def _sphere(problem: Problem, found: field.Field, with_mesh: bool) -> tuple[Content, bool]:
+    """Fit a sphere that begins at the map. Return its content of field.json, and whether the fit converged."""
+    try:
+        start = inclusion.start_from(problem, found)
+    except InputError as e:  # the map is finished, so it is written all the same
+        _warn(str(e))
+        return {"warnings": [str(e)]}, False
+    sphere = inclusion.estimate(problem, found.name, start)
+    print(field_report.table_of_numbers(sphere))
+    small = inclusion.size_sentence(problem.scenes[0].mesh, sphere)
+    _warn(field_report.misfit_sentence(sphere, with_mesh))
+    _warn(small)
+    content = field_report.of_numbers(sphere, with_mesh)
+    content["warnings"] += [small] if small else []
+    return content, sphere.converged
 
 
 def _tell_sizes(problem: Problem, beside: list[dict[str, float]]) -> None:

@@ -20,6 +20,7 @@ import numpy as np
 from fitting.fits.field import Field, start_of
 from fitting.fits.scene_numbers import Problem, Unknowns, fit
 from fitting.methods.estimate import Estimate
+from liverjax.core.errors import InputError
 from liverjax.core.struct import Number
 from liverjax.mesh.shape_functions import basis
 from liverjax.mesh.tetrahedra import TetMesh
@@ -64,6 +65,9 @@ def start_from(problem: Problem, field: Field) -> np.ndarray:
     whose ln(modulus) differs from the background by more than half of the largest difference. For this comparison, the
     differences are divided by the standard deviation of the map. Without this division, the sphere could begin at large
     differences in regions where the data contain little information, for example at corners.
+
+    Raises:
+        InputError: the map is uniform.
     """
     mesh = problem.scenes[0].mesh
     middle = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)].mean(axis=1)
@@ -76,6 +80,10 @@ def start_from(problem: Problem, field: Field) -> np.ndarray:
     sign = 1.0 if known.max() >= -known.min() else -1.0
     weight = volumes * np.maximum(sign * known - 0.5 * (sign * known).max(), 0.0)
     inside = weight > 0
+    if not inside.any():
+        raise InputError(
+            f"the map of {field.name} is uniform, so no sphere can be placed: fit no sphere, or give more accurate data"
+        )
     centre = (weight[:, None] * middle).sum(axis=0) / weight.sum()
     radius = np.cbrt(3 * volumes[inside].sum() / (4 * np.pi))
     contrast = away[inside].mean()

@@ -25,7 +25,7 @@ from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.scenes.checks.numbers import check_bounds
 from liverjax.scenes.scene import Scene, numbers_at
 from liverjax.simulation.automatic import with_solver
-from liverjax.simulation.mesh_error import mesh_error_of
+from liverjax.simulation.mesh_error import mesh_error_of, refuse
 from liverjax.simulation.run import prepared
 
 #: Function from a richer mesh to the parameters of the scene, by dotted name (see `mesh_error_of`).
@@ -263,6 +263,7 @@ def _errors_in(scene: Scene, data: Displacements, finer: Finer | None) -> tuple[
     errors are NaN. If the mesh error is unknown, the function warns."""
     readings = partial(_all_differences, data, scene)
     try:
+        refuse(scene)  # `prepared` replaces a loaded mesh, so this check must come before it
         run = lj.simulate(scene, mesh_error=finer is None)
         error = run.mesh_error
         if error is None:

@@ -82,10 +82,11 @@ def noise_sentence(found: Field) -> str | None:
     )
 
 
-def map_sentences(found: Field) -> list[str]:
+def map_sentences(mesh: TetMesh, found: Field) -> list[str]:
     """Return all warnings about a map."""
-    first = (noise_sentence(found), distance_sentence(found), level_sentence(found))
-    return [*(sentence for sentence in first if sentence is not None), *map_bias_sentences(found)]
+    known = _where_mapped(mesh, found)
+    first = (noise_sentence(found), distance_sentence(found), level_sentence(known))
+    return [*(sentence for sentence in first if sentence is not None), *map_bias_sentences(known)]
 
 
 def of_numbers(found: Estimate, with_mesh: bool = False) -> Content:
@@ -116,27 +117,29 @@ def _mapped(mesh: TetMesh, found: Field) -> np.ndarray:
     return np.unique(mesh.element_nodes_on_host[:, ~found.given])
 
 
-def _sd_of_map(mesh: TetMesh, found: Field) -> np.ndarray:
-    """Return the standard deviations of the logarithm of the map at the mapped vertices (see `_mapped`)."""
+def _where_mapped(mesh: TetMesh, found: Field) -> Field:
+    """Return the field with the standard deviations and the biases of only the mapped vertices (see `_mapped`)."""
     mapped = _mapped(mesh, found)
-    return found.sd[mapped[mapped < len(found.sd)]]
+    mapped = mapped[mapped < len(found.sd)]
+    of_mesh, of_steps = (None if b is None else b[mapped] for b in (found.mesh_bias, found.time_step_bias))
+    return found._replace(sd=found.sd[mapped], mesh_bias=of_mesh, time_step_bias=of_steps)
 
 
 def of_field(mesh: TetMesh, found: Field) -> Content:
     """Return the content of field.json for a map."""
-    sd = _sd_of_map(mesh, found)
+    known = _where_mapped(mesh, found)
     return {
         "name": found.name,
         "smallest": float(found.modulus[~found.given].min()),
         "largest": float(found.modulus[~found.given].max()),
         "elements_given_by_regions": int(found.given.sum()),
-        "smallest_standard_deviation_of_ln": float(np.min(sd)),
-        "largest_standard_deviation_of_ln": float(np.max(sd)),
+        "smallest_standard_deviation_of_ln": float(np.min(known.sd)),
+        "largest_standard_deviation_of_ln": float(np.max(known.sd)),
         "prior_deviation": found.deviation,
         "correlation_length_m": found.length,
         **{
             f"largest_{key}_of_ln": None if bias is None else float(np.abs(bias).max())
-            for key, bias in (("mesh_bias", found.mesh_bias), ("time_step_bias", found.time_step_bias))
+            for key, bias in (("mesh_bias", known.mesh_bias), ("time_step_bias", known.time_step_bias))
         },
         "chi2_per_component": found.chi2 / found.components,
         "discrepancy_reached": found.reached,
@@ -146,7 +149,7 @@ def of_field(mesh: TetMesh, found: Field) -> Content:
         "standard_deviation_of_level_of_ln": found.level_sd,
         "history": found.history,
         "status": [NAMES[c] for c in found.codes],
-        "warnings": map_sentences(found),
+        "warnings": map_sentences(mesh, found),
         "run_time_s": found.seconds,
     }
 
@@ -239,7 +242,7 @@ def table_of_field(mesh: TetMesh, found: Field) -> str:
             f"{h['deviation']:8g}  {h['chi2_per_component']:14.4f}  {h['iterations']:10.0f}  {h['evaluations']:11.0f}  "
             f"{h['seconds']:7.1f}"
         )
-    own, sd = found.modulus[~found.given], _sd_of_map(mesh, found)
+    own, sd = found.modulus[~found.given], _where_mapped(mesh, found).sd
     known, factors = int(np.sum(found.eigenvalues > 1)), np.exp([np.min(sd), np.max(sd)])
     rows.append(
         f"{found.name} from {own.min():.4g} to {own.max():.4g}, known to a factor of "

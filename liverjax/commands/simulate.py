@@ -127,7 +127,6 @@ def _asked_for(options: argparse.Namespace, scene: "Scene", text: str) -> tuple[
 def _check_before_steps(options: argparse.Namespace, scene: "Scene") -> None:
     """Raise `InputError` if a static or dynamic scene and the options cannot be used together."""
     from liverjax.jobs.long_run import check_every
-    from liverjax.simulation import automatic
     from liverjax.simulation.mesh_error import refuse
 
     if options.about:
@@ -138,7 +137,7 @@ def _check_before_steps(options: argparse.Namespace, scene: "Scene") -> None:
 
         refuse_unknown_physics(scene)
     if options.mesh_error:
-        refuse(automatic.chosen(scene))
+        refuse(scene)
 
 
 def _check_outputs(options: argparse.Namespace, target: Path, scene: "Scene", reactions: bool) -> None:

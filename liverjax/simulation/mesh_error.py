@@ -142,7 +142,8 @@ def mesh_error_of(
             The estimate then also contains the error due to these numbers.
 
     Raises:
-        InputError: the scene has another mesh than the run, or uses the one-step scheme, which has an additional error.
+        InputError: the scene has another mesh than the run, has a loaded mesh, or uses the one-step scheme, which has
+            an additional error.
     """
     if positions.shape[1] != scene.mesh.number_of_nodes:
         raise InputError(
@@ -189,7 +190,7 @@ def richer(scene: Scene) -> Richer:
     """Create the scene in a richer space of functions (elements of the next order, or a refined mesh).
 
     Raises:
-        InputError: the scene uses the one-step scheme.
+        InputError: the mesh is loaded, or the scene uses the one-step scheme.
     """
     refuse(scene)
     if scene.porosity is not None and can_be_refined(scene):
@@ -239,10 +240,18 @@ def _may_lock(scene: Scene) -> bool:
 def refuse(scene: Scene) -> None:
     """Check that the mesh error of a scene can be estimated.
 
+    With a loaded mesh, the mesh also changes the reference shape. At the end of a static run both errors cancel, but
+    the estimate contains only the error of the run.
+
     Raises:
-        InputError: the scene uses the one-step scheme.
+        InputError: the mesh is loaded, or the scene uses the one-step scheme.
     """
-    if scene.solve.newton == "one_step":
+    if scene.points_are == "loaded":
+        raise InputError(
+            '[mesh] is = "loaded": the mesh error is unknown, because the reference shape also depends on the mesh: '
+            "compare with a run on a finer mesh, without an estimate of the mesh error"
+        )
+    if automatic.is_one_step(scene.solve):
         raise InputError(
             "[solve] newton = 'one_step' has an additional error: use newton = 'converged' to estimate the mesh error"
         )

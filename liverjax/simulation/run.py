@@ -131,16 +131,19 @@ def simulate(
             square root of the number of steps). The steps between kept states run a second time. Without derivatives
             `store` has no effect. See `liverjax.simulation.gradients`.
         mesh_error: whether to estimate the mesh error (`liverjax.simulation.mesh_error`). Then the run must begin at
-            the reference positions. The estimate can be differentiated in forward mode only.
+            the reference positions, and the mesh must not be "loaded". The estimate can be differentiated in forward
+            mode only.
 
     Raises:
         InputError: unknown choices; harmonic motion or a reduced model; a time step or a mass is missing; numbers out
             of bounds; a loaded mesh for which no reference shape is found; precision "float64" although JAX's 64-bit
-            mode is off; a wrong shape of `start`; `mesh_error` together with `start` or the one-step scheme. Inside
-            jit, grad or vmap, numbers are not checked. If no reference shape is found there, the points are NaN and the
-            status of the steps is NOT_FINITE. `check_scene`, which is called when a scene file is read, checks more:
-            the mesh, the positions of obstacles, and whether the supports prevent rigid motions.
+            mode is off; a wrong shape of `start`; `mesh_error` together with a loaded mesh, `start` or the one-step
+            scheme. Inside jit, grad or vmap, numbers are not checked. If no reference shape is found there, the points
+            are NaN and the status of the steps is NOT_FINITE. `check_scene`, which is called when a scene file is read,
+            checks more: the mesh, the positions of obstacles, and whether the supports prevent rigid motions.
     """
+    if mesh_error:
+        refuse(scene)
     scene = prepared(scene)
     check_time_and_mass(scene)
     if start is not None:
@@ -149,9 +152,7 @@ def simulate(
             raise InputError(
                 f"the argument start has shape {start.shape}: give positions of shape {scene.mesh.points.shape}"
             )
-    if mesh_error:
-        refuse(scene)
-        if start is not None:
+        if mesh_error:
             raise InputError("mesh_error = True needs a run from the reference positions: remove start")
     result = _run(scene, start, report, gradient_checkpoints.number_kept(store, scene.solve.steps))
     if not mesh_error:
@@ -202,6 +203,10 @@ def prepared(scene: Scene) -> Scene:
         InputError: in the same cases as `simulate`, but a time step or a mass may be missing.
     """
     scene = _ready(scene)
+    if scene.solve.kind == "harmonic":
+        raise InputError(
+            "[solve] kind = 'harmonic' has no time steps: run python -m liverjax simulate, or call lj.harmonic(scene)"
+        )
     return unload(scene).scene if scene.points_are == "loaded" else scene
 
 
@@ -211,13 +216,15 @@ def unloaded(scene: Scene) -> Unloaded:
     The reference points have derivatives with respect to all numbers of the scene. The loads have their values
     at the beginning of the run: histories have their value at time 0, and prescribed motion has not begun. The body has
     been under these loads for a long time, so viscous stress has relaxed. Under load the vertices of quadratic elements
-    are at the given positions. In the reference shape the edges of these elements are straight.
+    are at the given positions. In the reference shape the edges of these elements are straight. In harmonic motion the
+    tractions cause only the vibration, so they do not act here.
 
     Raises:
-        InputError: in the same cases as `simulate`; the scene has a porous body or a rigid plate; no reference shape
-            was found (inside jit, grad or vmap the points are NaN instead).
+        InputError: in the same cases as `simulate`, but harmonic motion is allowed; the scene has a porous body or a
+            rigid plate; no reference shape was found (inside jit, grad or vmap the points are NaN instead).
     """
-    found = unload(_ready(replace(scene, points_are="loaded")))
+    loaded = replace(scene, points_are="loaded", traction=() if scene.solve.kind == "harmonic" else scene.traction)
+    found = unload(_ready(loaded))
     whole = replace(scene, mesh=with_points(scene.mesh, found.scene.mesh.points), points_are="reference")
     return found._replace(scene=whole)
 
@@ -225,10 +232,6 @@ def unloaded(scene: Scene) -> Unloaded:
 def _ready(scene: Scene) -> Scene:
     """Prepare a scene for its run as `prepared` does, but keep the given points."""
     check_before_run(scene)
-    if scene.solve.kind == "harmonic":
-        raise InputError(
-            "[solve] kind = 'harmonic' has no time steps: run python -m liverjax simulate, or call lj.harmonic(scene)"
-        )
     if scene.solve.reduced:
         file = scene.solve.reduced
         raise InputError(

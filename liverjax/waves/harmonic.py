@@ -310,8 +310,7 @@ def refuse_not_harmonic(scene: Scene) -> None:
     """
     if scene.points_are == "loaded":
         raise InputError(
-            '[mesh] is = "loaded" cannot be used in harmonic motion: use the scene of lj.unloaded(scene), and give the '
-            "last positions of a run of this scene as the argument 'about'"
+            '[mesh] is = "loaded" cannot be used in harmonic motion: in Python, use the scene of lj.unloaded(scene)'
         )
     if any(isinstance(physics, RoughObstacle | PressedObstacle) for physics in scene.physics):
         raise InputError(
