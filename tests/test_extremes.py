@@ -13,6 +13,8 @@ from liverjax.core.struct import replace
 from liverjax.mesh import shapes
 from liverjax.physics import boundary, viscosity
 from liverjax.physics.volumes.averaged import averaged_pressure
+from liverjax.simulation.equations import equations, force_sizes, initial_state, residual, unknowns
+from liverjax.simulation.run import prepared
 from liverjax.tensors.matrices import deformation_gradient, determinant
 
 pytestmark = pytest.mark.quick_to_compile
@@ -228,6 +230,28 @@ def test_a_hopeless_step_is_told():
     crushed = lj.Displaced(nodes=UNIT.node_sets["z_max"], by=jnp.array([0.0, 0.0, -1.5]))
     code = int(lj.simulate(replace(scene, displaced=(crushed,))).status[-1])
     assert code in (status.STEP_CUT, status.INDEFINITE, status.NOT_FINITE)
+
+
+@pytest.mark.parametrize(("precision", "by", "traction"), [("float32", 0, 0), ("float64", 10, 0), ("float32", 0, 0.1)])
+def test_a_body_without_loads_is_in_equilibrium(precision, by, traction):
+    """The body is at rest in single precision, or has moved by ten times its size. Roundoff is no residual there.
+
+    A small traction that is missing in the balance is one, also in single precision.
+    """
+    moved = 0.1 * by * jnp.array([1.0, 0.3, 0.0])
+    mesh = shapes.box((0.1, 0.1, 0.1), (3, 3, 3))
+    top = jnp.asarray(boundary.boundary_triangles(mesh, mesh.node_sets["z_max"]))
+    scene = lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=1e3, bulk=1e4),
+        displaced=(lj.Displaced(nodes=mesh.node_sets["z_min"], by=moved),),
+        traction=(lj.Traction(triangles=top, value=jnp.array([traction, 0.0, 0.0])),),
+        solve=lj.Solve(precision=precision, tolerance=1e-6 if precision == "float32" else 1e-9),
+    )
+    scene = prepared(scene)
+    e = equations(scene, initial_state(scene), 1.0, force_sizes(scene))
+    r, force, _ = residual(e, unknowns(e, jnp.asarray(mesh.points + moved[None], scene.mesh.points.dtype)), 1.0)
+    assert bool(jnp.linalg.norm(r) <= scene.solve.tolerance * force) == (traction == 0)
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from test_porosity import column
 
 import liverjax as lj
 from liverjax.__main__ import main
+from liverjax.core import status
 from liverjax.core.struct import replace
 from liverjax.jobs import output, waves
 from liverjax.mesh.tetrahedra import with_points
@@ -290,3 +291,18 @@ def test_a_loaded_mesh_is_unloaded_before_harmonic_motion():
     assert np.abs(force).max() < 1e-8 * np.abs(whole).max()
     with pytest.raises(lj.InputError, match="kind = 'harmonic' has no time steps"):
         lj.simulate(found.scene)
+
+
+def test_a_run_of_single_solves_that_is_not_in_equilibrium_is_refused(tmp_path):
+    """With newton = "one_step" each residual was accepted, so the body oscillated about a shape out of balance."""
+    mesh = lj.shapes.box((0.1, 0.1, 0.1), (1, 1, 1))
+    scene, x = lj.Scene(mesh=mesh, law=lj.laws.NeoHookean(mu=1e3, bulk=1e4)), np.asarray(mesh.points)
+    for residual, refused in ((1e-4, False), (0.02, True), (np.nan, True)):
+        with h5py.File(tmp_path / "result.h5", "w") as file:
+            file["positions"], file["reactions"], file["reference"] = x[None], 0 * x[None], x
+            file.attrs["status"], file.attrs["residual"] = [status.ONE_STEP], [residual]
+        if refused:
+            with pytest.raises(lj.InputError, match="so the body is not in equilibrium: repeat the run"):
+                waves._last_state(tmp_path / "result.h5", scene)
+        else:
+            assert np.array_equal(waves._last_state(tmp_path / "result.h5", scene)[0], x)

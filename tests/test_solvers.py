@@ -250,6 +250,19 @@ def test_a_step_that_fails_in_one_go_is_followed_in_parts():
     assert s.status != status.CONVERGED and np.isfinite(q)
 
 
+def test_a_step_without_solution_reports_the_residual_of_the_returned_values():
+    """q^2 - 1 + 3 s = 0 has no solution from s = 1/3. The residual of a smaller load was reported, near 0."""
+    method = Problem(
+        residual=lambda q, s: (q**2 - 1 + 3 * s, jnp.ones(()), None),
+        tangent=lambda q, s, by, near: 2 * q,
+        solve=lambda K, b, tolerance, most: (b / K, jnp.ones((), jnp.int32), jnp.array(True)),
+        preconditioner=lambda K: lambda r: r / K,
+    )
+    q, s, _ = jax.jit(lambda q: step_cutting.solve(method, q, StepOptions()))(jnp.ones(1))
+    assert s.status == status.STEP_CUT and s.cuts == StepOptions().max_cuts + 1
+    assert np.isclose(s.residual, abs(q[0] ** 2 + 2), rtol=1e-12)
+
+
 @pytest.mark.parametrize("kinks", [True, False])
 def test_where_springs_come_to_act_a_direction_halved_in_vain_is_taken_whole(kinks):
     """Two stiff springs act in compression only. The second one acts after a thousandth of the step, and |r| rises."""

@@ -61,6 +61,23 @@ def test_there_and_back():
         lj.simulate(heavy)
 
 
+def test_a_residual_of_roundoff_is_told_as_roundoff(monkeypatch):
+    """The advice was a stiffer law or smaller loads. With both, the roundoff is larger."""
+    scene = scene_from(content())
+    found = (scene.mesh.points, status.STALLED, 1e-4, 2e-4)
+    monkeypatch.setattr("liverjax.simulation.unloaded._found_shape", lambda _: found)
+    with pytest.raises(
+        InputError, match=r"is only roundoff, but is above the tolerance: use a tolerance above 0\.0002"
+    ):
+        unload(scene)
+    found = (scene.mesh.points.astype(jnp.float32), status.STALLED, 1e-4, 2e-4)
+    with pytest.raises(InputError, match=r'use precision = "float64" or a tolerance above 0\.0002'):
+        unload(scene)
+    found = (scene.mesh.points, status.STALLED, 1e-3, 2e-4)
+    with pytest.raises(InputError, match="smaller loads"):
+        unload(scene)
+
+
 def test_a_viscous_run_that_is_too_short_to_end_in_the_given_shape_is_told():
     viscosity, solve = {"ratios": [0.3], "relaxation_times": [0.3]}, {"dt": 0.05, "steps": 3}
     scene = scene_from(content(viscosity=viscosity, solve=solve))

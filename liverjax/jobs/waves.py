@@ -32,6 +32,8 @@ from liverjax.waves.rest import under_its_weight
 
 #: The program warns if the reactions of the relaxed body and of the run differ by more than this fraction.
 _RESTED = 0.05
+#: The body oscillates about the end of a run with newton = "one_step" only if the residual is below this value.
+_LARGEST_RESIDUAL = 1e-3
 #: Two reference shapes are equal if their nodes differ by less than this fraction of the largest coordinate. The
 #: roundoff of files in float32 is 1e-7.
 _SAME_SHAPE = 1e-6
@@ -89,6 +91,7 @@ def _last_state(file: Path, scene: Scene) -> tuple[jax.Array, np.ndarray]:
             x, reactions = (np.asarray(given[name][-1]) for name in ("positions", "reactions"))
             reference = np.asarray(given["reference"])
             code = int(np.ravel(read_by_step(given, "status"))[-1])
+            left = float(np.ravel(read_by_step(given, "residual"))[-1]) if code == status.ONE_STEP else 0.0
             text = str(given.attrs.get("scene", ""))
     except FileNotFoundError:
         raise InputError(f"--about {file} does not exist: give the result.h5 of a run of this scene") from None
@@ -113,6 +116,11 @@ def _last_state(file: Path, scene: Scene) -> tuple[jax.Array, np.ndarray]:
     if code not in (status.CONVERGED, status.ONE_STEP):
         raise InputError(
             f"--about {file}: the last step of this run is {status.NAMES[code]}; give a run that ended in equilibrium"
+        )
+    if not left <= _LARGEST_RESIDUAL:
+        raise InputError(
+            f"--about {file}: the last step of this run has the residual {left:.1g} of all forces, so the body is not "
+            'in equilibrium: repeat the run with smaller steps or with newton = "converged"'
         )
     loaded = _nodes_under_traction_of(text, scene)
     reactions[loaded[np.any(reactions[loaded] != 0, axis=1)]] = np.nan

@@ -32,6 +32,7 @@ from liverjax.simulation import automatic, tangent
 from liverjax.simulation.equations import Equations, Sizes, equations, force_sizes, initial_state, residual, unknowns
 from liverjax.solvers.block_matrix import columns, flat
 from liverjax.solvers.newton import NewtonOptions, newton_root
+from liverjax.solvers.step_cutting import ROUNDINGS
 
 #: A Newton step that does not reduce the residual is halved. Only the last linear solve needs high accuracy.
 _OPTIONS = NewtonOptions(max_iterations=50, linear_tolerance=1e-2, max_halvings=12, symmetric=False)
@@ -55,8 +56,14 @@ def unload(scene: Scene) -> Unloaded:
     Raises:
         InputError: no reference shape was found. Inside jit, grad or vmap no error is raised.
     """
-    points, code, relative = _found_shape(resting(scene))
+    points, code, relative, rounded = _found_shape(resting(scene))
     if not isinstance(code, jax.core.Tracer) and int(code) != status.CONVERGED:
+        if int(code) == status.STALLED and float(relative) <= float(rounded):
+            precise = 'precision = "float64" or ' if points.dtype == jnp.float32 else ""
+            raise InputError(
+                f'[mesh] is = "loaded": the residual {float(relative):.1g} of the forces is only roundoff, but is '
+                f"above the tolerance: use {precise}a tolerance above {2 * float(relative):.1g}"
+            )
         raise InputError(
             '[mesh] is = "loaded": no reference shape was found for the given shape under these loads (residual '
             f"{float(relative):.1g} of the forces); use a stiffer law, smaller loads or a better mesh"
@@ -96,8 +103,11 @@ def resting(scene: Scene) -> Scene:
 
 
 @jax.jit
-def _found_shape(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Find the reference positions (V, 3) [m]. Return them, a status code, and the relative residual."""
+def _found_shape(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Find the reference positions (V, 3) [m].
+
+    Return the positions, a status code, the relative residual, and the value below which this residual is roundoff.
+    """
     one, given = jnp.ones((), scene.mesh.points.dtype), scene.mesh.points
     sizes = force_sizes(scene)
     first = jax.lax.stop_gradient(equations(scene, initial_state(scene), one, sizes))
@@ -119,7 +129,7 @@ def _found_shape(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array]:
     # Loaded quadratic elements have curved edges, so their middles are not those of the given mesh.
     good = jnp.all(volume_ratios(mesh, mesh.points + u) > 0) & jnp.all(mesh.volumes > 0)
     code = jnp.where((found.status == status.CONVERGED) & ~good, status.INVERTED, found.status)
-    return mesh.points, code, found.residual
+    return mesh.points, code, found.residual, ROUNDINGS * first.roundoff / loads
 
 
 def _free_part(e: Equations, z: jax.Array) -> jax.Array:

@@ -46,8 +46,7 @@ _FLAT = 0.1
 _ONE_STEP = 1e-4
 #: A new tangent is made if |r|, divided by the norm of the right-hand side of the last direction, exceeds this value.
 _CONTRACTION = 0.15
-#: A new preconditioner is made if the linear iterations per digit of accuracy exceed this multiple of their first
-#: value.
+#: A new preconditioner is made if the linear iterations per digit exceed this multiple of their first value.
 _WEAR = 1.2
 #: Tolerance of the solves for derivatives, divided by the tolerance of the step.
 _ADJOINT = 0.1
@@ -376,10 +375,10 @@ def _judge(
     halvings = jnp.where(leap, 0, halvings)
     exhausted = failed & ~c.first & (s >= 1) & small
     lost = c.guessing & (failed | (c.launch & ~finite)) & ~exhausted
-    cuts = c.cuts + (failed & ~lost & ~exhausted)
+    closing = c.cuts > options.max_cuts
+    cuts = c.cuts + (failed & ~lost & ~exhausted & ~closing)
     launch_now = (c.launch & ~lost) | (converged & ~arrived)
-    hopeless = cuts > options.max_cuts
-    done = arrived | exhausted | (failed & ~lost & hopeless) | (c.launch & ~finite & ~lost)
+    done = arrived | exhausted | closing | (((cuts > options.max_cuts) | (c.launch & ~lost)) & ~finite)
     return _Verdict(
         accepted=better | launch_now,
         better=better,
@@ -399,6 +398,9 @@ def _judge(
 
 def _iterate(problem: Problem, options: StepOptions, start: jax.Array, c: _Point) -> _Point:
     """Evaluate the residual once, and solve for a direction if it is needed."""
+    # After the last allowed cut, the residual of the full load is evaluated at the last iterate, and is reported.
+    closing = c.cuts > options.max_cuts
+    c = c._replace(launch=c.launch & ~closing, remake=c.remake | closing, s=jnp.where(closing, 1.0, c.s))
     trial = jnp.where(c.launch, c.q_begin, jnp.where(c.remake, c.q, c.q + c.t * c.dq))
     s = jnp.where(c.launch, c.s_begin, c.s)
     r, force, by = _evaluated_near(problem, trial, s, c.beside, c.looser)
@@ -454,8 +456,7 @@ def _iterate(problem: Problem, options: StepOptions, start: jax.Array, c: _Point
     )
 
 
-#: Allowed error of the solve for the additional unknowns, divided by the residual that is expected after the next
-#: iteration.
+#: Allowed error of the solve for the additional unknowns, divided by the residual expected after the next iteration.
 _BESIDE = 0.1
 
 

@@ -189,7 +189,7 @@ def _operator(scene: Scene, about: jax.Array | AtRest | None, mass: str) -> Oper
     unmoved = tuple(replace(d, by=jnp.zeros(3), times=None, history=None) for d in scene.displaced)
     still = replace(scene, viscosity=None, porosity=None, displaced=unmoved, solve=solve)
     none = jnp.zeros(())
-    e = equations(still, initial_state(still), 1.0, Sizes(none, none))
+    e = equations(still, initial_state(still), 1.0, Sizes(none, none, none))
     if e.free.tied:
         raise InputError("a rigid plate cannot be used in harmonic motion: prescribe the motion of its nodes")
     e = e._replace(scene=scene)
