@@ -11,7 +11,7 @@ import liverjax as lj
 from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
 from liverjax.mesh.surface import areas as triangle_areas
-from liverjax.physics.contact.obstacle import Obstacle
+from liverjax.physics.contact.obstacle import Obstacle, contact_force
 from liverjax.physics.contact.shapes import SHAPES, distance
 from liverjax.scenes.scene_file import scene_from
 
@@ -94,6 +94,26 @@ def test_a_body_just_above_a_plane_counts_as_lying_on_it():
     found = lj.simulate(scene).check()
     assert int(found.statistics.iterations[0]) < 10
     np.testing.assert_allclose(lj.obstacle_forces(scene, found).force[0, -1], [0, 0, -1000.0 * SIDE**3], atol=1e-7)
+
+
+@pytest.mark.parametrize("gap", [0.0, 2e-9])
+def test_a_body_is_pulled_off_a_plane_in_few_iterations(gap):
+    """A surface without pressure had the contact stiffness up to 1e-6 of a triangle: an iteration moved it by 1 %."""
+    scene = lying()
+    x = scene.mesh.points
+    plane = replace(scene.physics[0], position=jnp.array([0.0, 0.0, -gap]), stiffness=1e10)
+    unit = jnp.zeros_like(x).at[:, 2].set(1.0)
+
+    @jax.jit
+    def force(u):
+        return jax.jvp(lambda u: contact_force(plane, scene.mesh, x + u * unit, jnp.zeros(3))[:, 2].sum(), (u,), (1.0,))
+
+    of_body, up, u = 1e-2 * float(force(0.0)[1]), 1e-8, 0.0
+    assert of_body > 0  # the surface touches the plane
+    for _ in range(3):
+        held, slope = map(float, force(u))
+        u += (of_body * (up - u) - held) / (of_body + slope)
+    assert np.isclose(u, up, rtol=1e-9, atol=0.0)
 
 
 @pytest.mark.parametrize(("ratio", "volumetric", "depth"), [(3.0, "element", 5e-5), (1e3, "mixed", 2e-5)])

@@ -142,7 +142,10 @@ traction = [{where = {x_min = 0.02}, value = [100.0, 0.0, 0.0]}]
     scene = lj.load_scene(tmp_path / "push.toml")
     x, reactions = waves._last_state(tmp_path / "result.h5", scene)
     assert waves._of_rest(scene, x, reactions, "--about run") == []
-    assert waves._of_rest(scene, x, 0.9 * reactions, "--about run")
+    far = Obstacle(triangles=scene.traction[0].triangles, position=jnp.array([-1.0, 0.0, 0.0]), axis=(1.0, 0.0, 0.0))
+    for physics, told in (((), False), ((far,), True)):
+        (said,) = waves._of_rest(replace(scene, physics=physics), x, 0.9 * reactions, "--about run")
+        assert ("give each obstacle of this scene its last position in the run" in said) == told
     unknown = np.where(reactions == 0, 0.0, np.nan)
     assert "was not checked, because a traction of that run" in waves._of_rest(scene, x, unknown, "--about run")[0]
 

@@ -10,6 +10,7 @@ from liverjax.core.struct import in_precision, replace
 from liverjax.physics import darcy, porosity
 from liverjax.physics.base import Step
 from liverjax.scenes.by_element import by_element
+from liverjax.scenes.checks.numbers import check_bounds
 from liverjax.scenes.scene_file import scene_from
 from liverjax.simulation.cautions.of_pressures import of_drained_layer
 from liverjax.simulation.cautions.of_run import cautions_of_run
@@ -39,6 +40,17 @@ def test_volumetric_stress_and_its_tangent_line():
     assert np.allclose(np.asarray(slope)[~above], 2200.0)
     assert np.isclose(jax.grad(lambda J: porosity.volumetric_stress(SPONGE, J))(J0 + 1e-9), 2200.0, rtol=1e-6)
     assert np.isclose(jax.grad(lambda J: porosity.volumetric_stress(SPONGE, J))(1.0), 400.0)
+
+
+def test_the_stress_is_the_derivative_of_the_energy_if_the_limit_is_low():
+    """With limit_bulk < 2 bulk, the logarithm was added to the tangent line: 32 % too much stress at J = 0.8."""
+    low, J = replace(SPONGE, bulk=1e3, limit_bulk=1.5e3, fluid_fraction=0.3), jnp.linspace(0.6, 1.2, 14)
+    J0 = 1 - 0.3 + 0.3 / 1.5
+    expected = 300.0 * np.log(1 + (np.maximum(J, J0) - 1) / 0.3) + 1.5e3 * np.minimum(J - J0, 0.0)
+    stress, slope = jax.vmap(jax.value_and_grad(lambda J: porosity.volumetric_stress(low, J)))(J)
+    np.testing.assert_allclose(stress, expected, rtol=1e-12)
+    np.testing.assert_allclose(stress, jax.vmap(jax.grad(lambda J: porosity.volumetric_energy(low, J)))(J), rtol=1e-12)
+    np.testing.assert_allclose(slope, porosity.volumetric_slope(low, J), rtol=1e-12)
 
 
 def test_stress_and_energy_in_float32_with_a_high_limit():
@@ -247,6 +259,7 @@ def test_unusable_porosity_is_refused(change, sentence):
 def test_a_number_of_a_porous_body_with_a_wrong_shape_is_refused():
     """Such a number was an error of JAX during the run."""
     scene = column(1, 1, 1.0)
+    check_bounds(replace(scene, porosity=replace(scene.porosity, bulk=jnp.array([400.0]))))  # like one number
     wrong = replace(scene, porosity=replace(scene.porosity, bulk=jnp.full(5, 400.0)))
     region = lj.Region(elements=jnp.arange(2), porosity={"bulk": 500.0})
     for own in (wrong, replace(wrong, region=(region,))):

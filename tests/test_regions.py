@@ -191,6 +191,8 @@ def test_bounds_and_points_on_a_face_are_found_in_single_precision():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert len(select_elements(rounded, {"z_min": 0.06}, None)) == 900
+    fine = lj.shapes.box((0.3, 0.3, 0.3), (100, 1, 1))  # a bound just beside a layer of nodes selected this layer
+    assert len(lj.boundary.select(fine, {"x_min": 1e-6})) == 400
     elements_at(rounded, np.array([[0.1, 0.05, 0.12], [0.2, 0.1, 0.12]]), "points")
     with pytest.raises(lj.InputError, match="outside the body"):
         elements_at(rounded, np.array([[0.1, 0.05, 0.12001]]), "points")

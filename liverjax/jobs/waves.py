@@ -18,6 +18,7 @@ from liverjax.core.struct import replace
 from liverjax.jobs.output import read_by_step
 from liverjax.jobs.reactions import held_forces
 from liverjax.mesh.files import meshio_cells
+from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene import Scene, Solve
@@ -160,10 +161,12 @@ def _of_rest(scene: Scene, x: jax.Array, reactions: np.ndarray, name: str) -> li
     apart = float(np.linalg.norm((relaxed - reactions)[at]) / np.linalg.norm(reactions[at]))
     if apart <= _RESTED:
         return []
+    obstacles = any(isinstance(own, Obstacle) for own in scene.physics)
+    place = ", and give each obstacle of this scene its last position in the run" if obstacles else ""
     return [
         f"in the state of {name}, the forces of the relaxed body differ from the forces of the run by "
         f"{100 * apart:.2g} %. The harmonic motion is computed for the relaxed body: let the body rest in the run for "
-        "much longer than its relaxation times, and use the same material in both scenes"
+        f"much longer than its relaxation times, and use the same material in both scenes{place}"
     ]
 
 

@@ -139,9 +139,10 @@ def _with_middles(points: np.ndarray, tets: np.ndarray, node_sets: dict, element
             "edges of their elements); export the mesh again, as VTU or Gmsh"
         )
     if np.any(new[of_file] != middles):
-        twice = of_file[new[of_file] != middles][0]
+        place = points[of_file[new[of_file] != middles][0]].tolist()
         raise InputError(
-            f"{name}: node {twice} is the middle node of two different edges; export the mesh again, as VTU or Gmsh"
+            f"{name}: the node at {place} m is the middle node of two different edges; export the mesh again, as VTU "
+            "or Gmsh"
         )
     if len(curved):
         warnings.warn(

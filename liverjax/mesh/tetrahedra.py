@@ -292,22 +292,22 @@ def check_mesh(mesh: TetMesh, name: str = "mesh") -> None:
         )
 
 
-#: Relative roundoff of coordinates with six digits. The roundoff of single precision is smaller.
-SIX_DIGITS = 5e-6
+#: Relative roundoff of coordinates with six digits, and an upper bound of the roundoff in single precision.
+SIX_DIGITS, SINGLE_PRECISION = 5e-6, 1.2e-7
 #: The roundoff of the coordinates is regarded as at most this fraction of an edge.
 OF_AN_EDGE = 1e-3
 
 
-def roundoff_of(mesh: TetMesh) -> float:
+def roundoff_of(mesh: TetMesh, relative: float = SIX_DIGITS) -> float:
     """Return the distance [m] below which two places in a mesh are regarded as the same place.
 
-    It is the roundoff of coordinates with six digits (`SIX_DIGITS`), but at most the fraction `OF_AN_EDGE` of the
-    shortest edge, and at least 1e-9 of the mesh's size.
+    It is the fraction `relative` of the largest coordinate, but at most the fraction `OF_AN_EDGE` of the shortest edge,
+    and at least 1e-9 of the mesh's size.
     """
     points, (low, high) = np.asarray(mesh.points), np.asarray(mesh.pattern.edges)
     shortest = np.linalg.norm(points[high] - points[low], axis=1).min()
     size = np.linalg.norm(np.ptp(points, axis=0))
-    return float(max(1e-9 * size, min(SIX_DIGITS * np.abs(points).max(), OF_AN_EDGE * shortest)))
+    return float(max(1e-9 * size, min(relative * np.abs(points).max(), OF_AN_EDGE * shortest)))
 
 
 #: The faces of a tetrahedron, counterclockwise if seen from outside.

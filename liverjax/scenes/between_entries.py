@@ -22,8 +22,8 @@ from liverjax.physics.prescribed import Displaced, Fixed
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.scenes.scene import Scene
 
-#: Two normals are parallel if the cosine of their angle differs from 1 or -1 by less than this value.
-_SAME_NORMAL = 1e-12
+#: Two normals are parallel if the sine of their angle is below this value.
+_SAME_NORMAL = 1e-6
 #: Weights of old nodes at a new node are roundoff if they are below this value.
 _SOME_WEIGHT = 1e-9
 
@@ -140,10 +140,12 @@ def _joined_slides(old: Scene, made: Scene, between: Callable[[list[np.ndarray]]
         if isinstance(own, SlidingSupport) and isinstance(now, SlidingSupport) and not own.axis
         if not isinstance(own.normal, jax.core.Tracer)
     }
-    normals = {k: np.asarray(own.normal, float) for k, (own, _) in oblique.items()}
+    # `SlidingSupport.check` accepts normals with roundoff, so their length may differ from 1.
+    given = {k: np.asarray(own.normal, float) for k, (own, _) in oblique.items()}
+    normals = {k: normal / np.linalg.norm(normal) for k, normal in given.items()}
     taken = [np.asarray(now.nodes) for _, now in oblique.values()]
     for k, normal in normals.items():
-        alike = [j for j in oblique if abs(abs(np.dot(normal, normals[j])) - 1) < _SAME_NORMAL]
+        alike = [j for j in oblique if np.linalg.norm(np.cross(normal, normals[j])) < _SAME_NORMAL]
         along = {axis for axis, part in zip(AXES, normal, strict=True) if abs(part) > _SOME_WEIGHT}
         groups = [np.asarray(oblique[j][0].nodes) for j in alike]
         groups += [np.asarray(entry.nodes) for entry in old.fixed if along <= set(entry.axes)]

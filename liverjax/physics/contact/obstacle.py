@@ -39,8 +39,8 @@ from liverjax.solvers.attached import Attached
 #: Stiffness of the contact, divided by the stiffness of a layer of the body's material. The layer is as thick as a
 #: triangle is wide.
 HARDNESS = 100.0
-#: A point counts as touching if its distance, divided by the size of a triangle, is at most `_TOUCHING`. If the
-#: obstacle presses on no point, the limit is `_NEAR`: nodes of files in float32 have roundoff.
+#: A point counts as touching if its distance, divided by the size of a triangle, is at most `_TOUCHING`. In the
+#: reference shape, the limit is `_NEAR`: nodes of files in float32 have roundoff (see `just_touching`).
 _TOUCHING, _NEAR = 1e-9, 1e-6
 #: Weights (Q,) and barycentric coordinates (3, Q) of Q = 3 contact points of a triangle (integration rule of degree 2).
 _POINTS = np.full(3, 1 / 3), np.full((3, 3), 1 / 6) + 0.5 * np.eye(3)
@@ -270,29 +270,19 @@ def contact_force(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Ar
     x (V, 3) are the positions of the body. The obstacle is displaced by `moved` (3,).
     """
     d = _distances(obstacle, mesh, x, moved)
-    depth = depths(d, touching_distance(obstacle, mesh))
+    depth = depths(d, just_touching(obstacle, mesh, d))
     push = weighted_stiffness(obstacle, mesh) * depth  # (Q, m) [N] contact force at each point, times -1
     return shared_out(obstacle, mesh, x, jnp.stack([push * n for n in d.normal]))
 
 
-def depths(d: Distance, near: jax.Array) -> jax.Array:
+def depths(d: Distance, touching: jax.Array) -> jax.Array:
     """Return the signed distances (Q, m) [m] of points inside the obstacle (negative), and 0 for other points.
 
-    Points that touch (see `touches`) count as pressed, so they have a stiffness. `jnp.minimum(d.value, 0)` is not
+    Points of the mask `touching` (Q, m) count as pressed, so they have a stiffness. `jnp.minimum(d.value, 0)` is not
     used, because its derivative in JAX is only half of the correct value at a point that just touches.
     """
     pressed = d.value - jax.lax.stop_gradient(jnp.maximum(d.value, 0.0))
-    return jnp.where(touches(d, near), pressed, 0.0)
-
-
-def touches(d: Distance, near: jax.Array) -> jax.Array:
-    """Return whether points (Q, m) with distances `d` are inside the obstacle, or near enough to count as touching.
-
-    `near` (m,) [m] is the maximum distance of such a point. If the obstacle presses on no point, the maximum distance
-    is larger (see `_NEAR`).
-    """
-    lying = jnp.all(d.value >= -near[None])
-    return d.value <= jnp.where(lying, _NEAR / _TOUCHING, 1.0) * near[None]
+    return jnp.where(touching, pressed, 0.0)
 
 
 def shared_out(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, pushes: jax.Array) -> jax.Array:
@@ -368,12 +358,20 @@ def _distances(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array
 
 
 def just_touching(obstacle: Obstacle, mesh: TetMesh, d: Distance) -> jax.Array:
-    """Return whether points (Q, m) with distances `d` are inside the obstacle, or near enough to count as touching."""
-    return touches(d, touching_distance(obstacle, mesh))
+    """Return whether points (Q, m) with distances `d` are inside the obstacle, or near enough to count as touching.
+
+    A body that lies on the obstacle may have a small gap, because of the roundoff of its nodes (see `_NEAR`). Points
+    that are not farther away than in the reference shape touch despite this gap, if the obstacle presses on no point.
+    Points that move away do not touch: a stiffness would make their motion in Newton's method very slow.
+    """
+    near = touching_distance(obstacle, mesh)[None]
+    gap = _distances(obstacle, mesh, mesh.points, obstacle.displacement(0, 1, 0.0)).value
+    at_gap = (gap <= _NEAR / _TOUCHING * near) & (d.value <= gap + near)
+    return (d.value <= near) | (at_gap & jnp.all(d.value >= -near))
 
 
 def touching_distance(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
-    """Return the maximum distance (m,) [m] of a point that counts as touching a pressed surface of m triangles."""
+    """Return the maximum distance (m,) [m] of a point that counts as touching, for each of m triangles."""
     return _TOUCHING * jnp.sqrt(_triangle_areas(obstacle, mesh))
 
 

@@ -32,7 +32,6 @@ from liverjax.physics.contact.obstacle import (
     point_functions,
     shared_out,
     three_numbers,
-    touches,
     touching_distance,
     touching_nodes,
     weighted_stiffness,
@@ -206,7 +205,8 @@ class Pressing(Touching):
         derivative is that with respect to `travel`. `at` are the contact points.
         """
         d = distances(self.obstacle, at, travel * self.direction)
-        depth, inside = depths(d, self.near), touches(d, self.near).astype(at.dtype)
+        inside = d.value <= self.near[None]
+        depth, inside = depths(d, inside), inside.astype(at.dtype)
         along = sum(n * t for n, t in zip(d.normal, self.direction, strict=True))
         bent = sum(self.direction[i] * d.bent[i][j] * self.direction[j] for i in range(3) for j in range(3))
         slope = self.hardness * (inside * along * along + depth * bent)
@@ -260,7 +260,7 @@ class Pressing(Touching):
         at = self.points(x)
         d = distances(self.obstacle, at, self.travel(at, s) * self.direction)
         towards = sum(n * t for n, t in zip(d.normal, self.direction, strict=True))
-        along = self.hardness * touches(d, self.near) * towards
+        along = self.hardness * (d.value <= self.near[None]) * towards
         pushes = jnp.stack([along * n for n in d.normal])
         if not definite:
             depth = self.hardness * jnp.minimum(d.value, 0.0)

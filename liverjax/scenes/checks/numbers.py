@@ -40,7 +40,7 @@ def check_bounds(scene: Scene) -> None:
         E, order = scene.mesh.number_of_elements, scene.mesh.order
         of_points = () if order == 1 else ((1, E), (len(basis(order).weights), E))
         for name in POROUS:
-            bounds.check_shape(f"porosity.{name}", getattr(scene.porosity, name), (), (E,), *of_points)
+            bounds.check_shape(f"porosity.{name}", getattr(scene.porosity, name), (), (E,), *of_points, (1,))
         porosity.check_limit(scene.porosity)
     check_region_numbers(scene)
 
