@@ -322,7 +322,7 @@ def test_points_outside_the_limits_are_left_out_and_said():
     assert "are ignored as requested" in kept.notes[-1] and len(kept.storage_sd) == len(kept.storage)
     assert within(s, None, None) is s and within(s, None, 1e9) is s
     for low, high, sentence in (
-        (None, 0.01, r"keep only 0 of 31 points .*keep 3 frequencies or more"),
+        (None, 0.01, r"keep only 0 of 31 points .*keep 3 or more frequencies"),
         (None, -1.0, "--max-frequency -1 is not a frequency"),
         (float("nan"), None, "--min-frequency nan is not a frequency"),
     ):

@@ -54,3 +54,13 @@ def test_the_command_writes_it(tmp_path, capsys):
     assert (tmp_path / "report.pdf").read_bytes().startswith(b"%PDF")
     assert main([data, data, "--report", "--out", str(tmp_path)]) == 2
     assert "--report" in capsys.readouterr().err
+
+
+def test_the_title_names_one_file_and_shows_where_it_is_cut():
+    """The title split a path at a comma, and had no mark where it was cut."""
+    sweep = rheometer.read_sweep(ROOT / "data" / "lions_mane_frequency_sweep.csv")
+    fit = viscoelastic.closed_form(sweep, 2)
+    content = sweep_report.summary(fit, sweep) | {"notes": [], "versions": versions()}
+    for source, name in (("x, y/a, b.csv", "a, b.csv: "), ("x/" + 60 * "a", 51 * "a" + "…: ")):
+        figure = one_page.page(sweep._replace(source=source), [fit], content)
+        assert figure.get_suptitle().startswith(name)

@@ -10,6 +10,7 @@ from fitting.master import master_curve
 from fitting.methods import generalised_maxwell, time_response
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.frequency_sweep import Sweep
+from fitting.readers.rheometer import read_sweep
 from fitting.readers.time_tests import TimeTest
 from fitting.reports import prediction
 from fitting.waves import shear_waves
@@ -59,8 +60,27 @@ def test_a_test_at_another_temperature_is_shifted_to_the_reference():
     tests, told = master_curve.at_reference([*tests, relaxation()], shift)
     assert np.allclose(tests[0].angular_frequency, 10 * OMEGA) and np.allclose(tests[0].loss, 10**0.1 * one.loss)
     assert told[0].startswith("a.csv: measured at 20.1 °C; its frequencies are multiplied by the shift factor 10")
-    assert told[1].startswith("a.csv: measured at 30 °C, but predicted at 40 °C") and len(told) == 2
+    assert told[1].startswith("a.csv: measured at 30 °C, but predicted at 40 °C")
     assert all(np.array_equal(own.angular_frequency, OMEGA) for own in tests[1:3])
+    assert len(told) == 3 and told[2].startswith("relaxation.csv: its temperature is not known")
+
+
+def test_a_temperature_in_the_name_of_the_table_counts(tmp_path):
+    """Such a sweep was predicted without a shift and without a note."""
+    shift = {"reference_temperature_C": 40.0, "temperatures_C": [20.0, 40.0], "log10_a": [1.0, 0.0]}
+    shift["log10_b"] = [0.0, 0.0]
+    rows = "".join(f"{f}\t{1 + f}\t{f}\n" for f in (1, 2, 3, 4))
+    head = "frequency_Hz\tstorage_modulus_Pa\tloss_modulus_Pa\n"
+    (tmp_path / "t.txt").write_text(f"[step]\nSweep 20 °C\n{head}{rows}")
+    (tmp_path / "u.csv").write_text((head + rows).replace("\t", ","))
+    named, unknown = (read_sweep(tmp_path / name) for name in ("t.txt", "u.csv"))
+    several = unknown._replace(raw={"temperature": 273.15 + np.array([10.0, 20.0, 60.0, 70.0])})
+    tests, told = master_curve.at_reference([named, unknown, several], shift)
+    assert np.allclose(tests[0].angular_frequency, 10 * named.angular_frequency)
+    assert np.array_equal(tests[2].angular_frequency, several.angular_frequency)
+    assert "shift factor 10" in told[0] and "its temperature is not known" in told[1]
+    # The mean of these temperatures is 40 °C. The note said: measured at 40 °C, but predicted at 40 °C.
+    assert "it has several temperatures (10 to 70 °C)" in told[2] and len(told) == 3
 
 
 def test_errors_of_a_sweep_with_deviations_are_relative_to_its_moduli():

@@ -288,21 +288,24 @@ def test_deviations_are_smoothed_in_each_of_several_joined_sweeps():
         own.append(Sweep(omega, *G, error * G[0], error * G[1], source=f"{k}.csv", sd_before=True))
     whole = joined(own)
     assert np.allclose(whole.deviations[0], whole.storage_sd, rtol=0.01)
-    assert whole.sd_before and not whole.sd_estimated and whole.source == "0.csv, 1.csv"
+    assert whole.sd_before and not whole.sd_estimated and whole.source == "0.csv and 1 more file"
 
 
-@pytest.mark.parametrize("samples", [1, 3])
-def test_moduli_of_tension_have_the_size_error_of_a_force(tmp_path, samples):
-    """They had the error of torque over twist, with the fourth power of the radius."""
+@pytest.mark.parametrize(("samples", "load", "power"), [(1, "E", 2), (3, "E", 2), (1, "bending", 4), (3, "bending", 4)])
+def test_moduli_of_tension_have_the_size_error_of_a_force(tmp_path, samples, load, power):
+    """They had the error of torque over twist, with the fourth power of the radius. Then moduli of bending had the error
+    of a force, but the stiffness of a bent rod contains the fourth power."""
     omega, files = np.geomspace(0.1, 100, 20), []
     for k in range(samples):
         E = 3000 * (1 + 0.02 * k) * (0.5 + 0.5j * omega / (1 + 1j * omega))
         E = E * (1 + 0.01 * np.random.default_rng(k).standard_normal(20))
         files.append(str(tmp_path / f"{k}.csv"))
-        head = "angular_frequency_rad_s,E' [Pa],E'' [Pa]"
+        bent = load == "bending"
+        names = ("Flexural storage modulus", "Flexural loss modulus") if bent else ("E'", "E''")
+        head = "angular_frequency_rad_s," + ",".join(f"{name} [Pa]" for name in names)
         np.savetxt(files[-1], np.column_stack([omega, E.real, E.imag]), delimiter=",", header=head, comments="")
     ask = ["--method", "closed-form", "--modes", "1", "--radius", "0.001", "--height", "0.02"]
     assert main([*files, *ask, "--out", str(tmp_path / "out")]) == 0
     content = json.loads((tmp_path / "out" / "fit.json").read_text())
     for own in content.get("samples", [content]):
-        assert own["details"]["geometry_error"] == pytest.approx(np.hypot(50e-6 / 0.02, 2 * 10e-6 / 0.001))
+        assert own["details"]["geometry_error"] == pytest.approx(np.hypot(50e-6 / 0.02, power * 10e-6 / 0.001))

@@ -38,7 +38,7 @@ def run(options: argparse.Namespace) -> int:
     usual = Simulation()
     rig = Simulation(radius=options.radius or usual.radius, height=options.height or usual.height)
     for fit, sweep in zip(found.fits, found.sweeps, strict=True):
-        fit.details["geometry_error"] = total_error.of_geometry(rig, None, sweep.tensile)
+        fit.details["geometry_error"] = total_error.of_geometry(rig, None, sweep.load == "tension")
     content = samples_report.write(options.out, found)
     print(samples_report.table(found))
     if options.cards:

@@ -112,8 +112,9 @@ def prepare_outputs(options: argparse.Namespace, files: tuple[str, ...], inputs:
 def usable_sweep(options: argparse.Namespace, path: Path, error_is_fitted: bool = False) -> "Sweep":
     """Read a sweep, and ignore the points at which the instrument dominates. If --max-frequency is given, only these
     points are ignored: points outside the band, and points at which the raw torque or the raw phase shows too much
-    inertia of the instrument (`without_inertia`). The same holds if the file shows the inertia and its error is fitted
-    later (`error_is_fitted`), because this error may explain the mark of the instrument."""
+    inertia of the instrument (`without_inertia`). These points are also the only ignored ones if the file shows the
+    inertia and its error is fitted later (`error_is_fitted`), because this error may explain the mark of the
+    instrument."""
     from fitting.readers import rheometer
 
     try:

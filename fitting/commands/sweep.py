@@ -420,7 +420,7 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
         fits.append(_simulated(options, corrected, fits[0], simulation.run))
         fits[1].details.update(heavy)
     for fit in fits:
-        fit.details["geometry_error"] = total_error.of_geometry(simulation, options.gap_error, sweep.tensile)
+        fit.details["geometry_error"] = total_error.of_geometry(simulation, options.gap_error, sweep.load == "tension")
     for fit in fits if options.precompression else ():  # `compression_numbers` uses `geometry_error`
         fit.details["precompression"] = compressed_sample.compression_numbers(fit, simulation)
     return fits, corrected

@@ -56,7 +56,8 @@ def errors_of_sizes(options: argparse.Namespace, tests: "list[Measured]") -> np.
             return 0.0
         if isinstance(test, TimeTest) and test.described:
             return total_error.of_described_sizes(test.per_size)
-        return total_error.of_geometry(rig, None, test.axial if isinstance(test, TimeTest) else test.tensile)
+        axial = test.axial if isinstance(test, TimeTest) else test.load == "tension"
+        return total_error.of_geometry(rig, None, axial)
 
     return np.array(list(map(error_of, tests)))
 

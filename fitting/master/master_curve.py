@@ -9,7 +9,7 @@ import scipy.special
 from fitting.master import shifts, temperature_laws
 from fitting.master.shifts import Shifts
 from fitting.master.temperature_laws import TemperatureLaw
-from fitting.master.temperature_sweeps import SAME, AtTemperatures, joined
+from fitting.master.temperature_sweeps import SAME, AtTemperatures, joined, temperatures_in
 from fitting.readers.frequency_sweep import Sweep, merged, scatter
 from fitting.readers.rheometer import WARMER
 from fitting.readers.units import celsius
@@ -199,28 +199,49 @@ def _unshown_factors(sweeps: list[Sweep], found: Shifts) -> list[str]:
 
 def at_reference(tests: "Sequence[Measured]", shift: Content) -> "tuple[list[Measured], list[str]]":
     """Return the tests with the frequencies and moduli that they have at the reference temperature, and a sentence on
-    each test at another temperature. `shift`: `shift_numbers` of the master curve."""
-    out, told, reference = [], [], shift["reference_temperature_C"]
-    for test in tests:
-        raw = test.raw if isinstance(test, Sweep) else None
-        heat = celsius((raw or {}).get("temperature", np.empty(0)))
-        heat = heat[np.isfinite(heat)]
-        T = float(np.mean(heat)) if heat.size else reference
-        near = np.abs(np.array(shift["temperatures_C"]) - T)
-        k = int(np.argmin(near))
-        if max(abs(T - reference), np.ptp([*heat, T])) > WARMER:
-            at = f"{test.source}: measured at {T:.4g} °C"
-            if isinstance(test, Sweep) and near[k] < SAME and np.ptp(heat) <= WARMER:
-                log_a, log_b = (shift[name][k] for name in ("log10_a", "log10_b"))
-                test = _shifted_sweep(test, log_a, log_b)
-                told.append(f"{at}; its frequencies are multiplied by the shift factor {10.0**log_a:.4g}")
-            else:
-                told.append(
-                    f"{at}, but predicted at {reference:.4g} °C, because no sweep at its temperature is fitted: choose "
-                    "a reference temperature near to it, or give such a sweep"
-                )
-        out.append(test)
-    return out, told
+    each test at another temperature or at an unknown one. `shift`: `shift_numbers` of the master curve."""
+    each = [_test_at_reference(test, shift) for test in tests]
+    return [test for test, _ in each], [sentence for _, sentence in each if sentence]
+
+
+def _test_at_reference(test: "Measured", shift: Content) -> "tuple[Measured, str]":
+    """Return one test and the sentence of `at_reference` on it (empty if there is none)."""
+    reference, heat = shift["reference_temperature_C"], _temperatures_of(test)
+    if not isinstance(test, Sweep) or not heat.size:
+        add = "add a column temperature_C, or " if isinstance(test, Sweep) else ""
+        return test, (
+            f"{test.source}: its temperature is not known, so it is predicted at {reference:.4g} °C without a shift: "
+            f"{add}check that it was measured at this temperature"
+        )
+    if np.ptp(heat) > WARMER:
+        return test, (
+            f"{test.source}: it has several temperatures ({heat.min():.4g} to {heat.max():.4g} °C), so it is predicted "
+            f"at {reference:.4g} °C without a shift: give one file for each temperature"
+        )
+    T = float(np.mean(heat))
+    if abs(T - reference) <= WARMER:
+        return test, ""
+    near = np.abs(np.array(shift["temperatures_C"]) - T)
+    k = int(np.argmin(near))
+    at = f"{test.source}: measured at {T:.4g} °C"
+    if near[k] < SAME:
+        log_a, log_b = (shift[name][k] for name in ("log10_a", "log10_b"))
+        shifted = _shifted_sweep(test, log_a, log_b)
+        return shifted, f"{at}; its frequencies are multiplied by the shift factor {10.0**log_a:.4g}"
+    return test, (
+        f"{at}, but predicted at {reference:.4g} °C, because no sweep at its temperature is fitted: choose a reference "
+        "temperature near to it, or give such a sweep"
+    )
+
+
+def _temperatures_of(test: "Measured") -> np.ndarray:
+    """Return the temperatures (n,) [°C] in the column of a sweep, or else in the name of its table. Empty if they are
+    unknown."""
+    if not isinstance(test, Sweep):
+        return np.empty(0)
+    T = (test.raw or {}).get("temperature", np.empty(0))
+    T = T[np.isfinite(T)]
+    return celsius(T if T.size else np.array(temperatures_in(test.table)))
 
 
 def shift_numbers(found: MasterCurve) -> Content:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fitting.methods.kramers_kronig import without_instrument
+from fitting.readers import raw_torque
 from fitting.readers.frequency_sweep import FEWEST, Sweep, some, within, without_inertia
 from fitting.readers.rheometer import REPEATED, SORTED, read_all_sweeps
 from fitting.readers.units import celsius
@@ -99,25 +100,45 @@ def with_usable_points(
     data: AtTemperatures, band: tuple[float | None, float | None], radius: float | None, height: float | None
 ) -> AtTemperatures:
     """Return the data without the points at which the instrument dominates, and without the points outside the band.
-    Notes say which points are ignored, and at which temperatures.
+    Notes say which points are ignored, and at which temperatures. A temperature is ignored if too few of its points
+    remain: fewer than `FEWEST` frequencies if shifts are fitted, or none if the shift factors are given.
 
     Args:
         data: sweeps that are not shifted.
         band: lowest and highest measured frequency [Hz], or None. If the highest one is given, the points that show the
             mark of the instrument (`without_instrument`) are kept, as in a fit of one sweep.
         radius, height: of the sample [m], if they are known.
+
+    Raises:
+        InputError: fewer than two temperatures remain.
     """
-    sweeps, told = [], dict[str, list[str]]()
-    for sweep, T in zip(data.sweeps, celsius(data.temperatures), strict=True):
-        own = within(sweep._replace(source=f"{sweep.source} at {T:.4g} °C", notes=()), *band)
-        own = without_inertia(own, radius, height)
-        own = own if band[1] else without_instrument(own)
+    fewest = FEWEST if data.shift_factors is None else 1
+    highest = max(float(sweep.angular_frequency[-1]) for sweep in data.sweeps)
+    sweeps, told, faults, notes = [], dict[str, list[str]](), list[InputError](), list[str]()
+    kept = np.ones(len(data.sweeps), bool)
+    for k, (sweep, T) in enumerate(zip(data.sweeps, celsius(data.temperatures), strict=True)):
+        named = sweep._replace(source=f"{sweep.source} at {T:.4g} °C", notes=())
+        try:
+            own = without_inertia(within(named, *band, fewest), radius, height, fewest)
+        except InputError as fault:
+            kept[k] = False
+            faults.append(fault)
+            why = str(fault).removeprefix(f"{named.source}: ")
+            notes += [*sweep.notes, f"the points at {T:.4g} °C are ignored: {why}"]
+            continue
+        own = own if band[1] else without_instrument(own, highest)
         for note in own.notes:
             told.setdefault(note, []).append(f"{T:.4g}")
         sweeps.append(own._replace(source=sweep.source, notes=sweep.notes))
-    notes = [f"at {', '.join(places)} °C: {note}" for note, places in told.items()]
+    if not sweeps:
+        raise faults[0]
+    if len(sweeps) < 2:
+        left = f"{celsius(data.temperatures[kept][0]):.4g} °C"
+        raise InputError(f"{faults[0]} (--master needs two or more temperatures, and only {left} remains)")
+    notes += [f"at {', '.join(places)} °C: {note}" for note, places in told.items()]
     sweeps[0] = sweeps[0]._replace(notes=(*sweeps[0].notes, *notes))
-    return data._replace(sweeps=sweeps)
+    factors = None if data.shift_factors is None else data.shift_factors[kept]
+    return data._replace(sweeps=sweeps, temperatures=data.temperatures[kept], shift_factors=factors)
 
 
 def _mean_factor(factors: np.ndarray) -> float:
@@ -143,7 +164,8 @@ def _index_of_group(T: np.ndarray, exact: bool) -> np.ndarray:
 
 def joined(sweeps: Sequence[Sweep]) -> Sweep:
     """Return one sweep with all points of several sweeps, sorted by frequency. It has standard deviations if all
-    sweeps have them, and the raw columns that all sweeps have."""
+    sweeps have them, and all raw columns of the instrument. Where a sweep has no such column, its values are NaN. Other
+    raw columns are kept if all sweeps have them."""
     omega = np.concatenate([s.angular_frequency for s in sweeps])
     order = np.argsort(omega, kind="stable")
     storage, loss = (np.concatenate([getattr(s, q) for s in sweeps])[order] for q in ("storage", "loss"))
@@ -156,26 +178,32 @@ def joined(sweeps: Sequence[Sweep]) -> Sweep:
         storage_sd, loss_sd = (
             np.concatenate([getattr(s, q) for s in sweeps])[order] for q in ("storage_sd", "loss_sd")
         )
+    files = tuple(dict.fromkeys(file for s in sweeps for file in s.files or (s.source,)))
+    more = f" and {len(files) - 1} more file{'s' if len(files) > 2 else ''}" if len(files) > 1 else ""
     raws, greys = [s.raw or {} for s in sweeps], [s.grey for s in sweeps if s.grey is not None]
+    names = [q for q in {q for raw in raws for q in raw} if q in raw_torque.COLUMNS or all(q in raw for raw in raws)]
+    columns = {
+        q: [raw.get(q, np.full(len(s.loss), np.nan)) for s, raw in zip(sweeps, raws, strict=True)] for q in names
+    }
     return Sweep(
         omega[order],
         storage,
         loss,
         storage_sd,
         loss_sd,
-        source=", ".join(dict.fromkeys(s.source for s in sweeps)),
+        source=f"{files[0]}{more}",
         notes=tuple(dict.fromkeys(notes)),
-        raw={q: np.concatenate([raw[q] for raw in raws])[order] for q in raws[0] if all(q in raw for raw in raws)}
-        or None,
+        raw={q: np.concatenate(parts)[order] for q, parts in columns.items()} or None,
         grey=np.concatenate(greys) if greys else None,
         sd_estimated=all(given) and all(s.sd_estimated for s in sweeps),
         sd_before=all(given) and all(s.sd_before for s in sweeps),
         sweep_numbers=np.repeat(np.arange(len(sweeps)), [len(s.storage) for s in sweeps])[order],
         load=next((s.load for s in sweeps if s.tensile), "shear"),
+        files=files,
     )
 
 
-def _temperatures_in(name: str) -> list[float]:
+def temperatures_in(name: str) -> list[float]:
     """Return the different temperatures [K] in the name of a table. Temperatures without the sign ° count only if none
     has this sign."""
     stated = _STATED.findall(name)
@@ -191,7 +219,7 @@ def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, flo
     T = raw.get("temperature", np.full(len(sweep.storage), np.nan))
     missing = ~np.isfinite(T)
     if np.any(missing):
-        stated = _temperatures_in(name)
+        stated = temperatures_in(name)
         if len(stated) != 1 and np.all(missing):
             found = ", ".join(f"{T:.4g} °C" for T in celsius(np.array(stated)))
             raise InputError(

@@ -66,12 +66,13 @@ def of_data(sweep: Sweep, dense: Spectrum, sizes: np.ndarray | None = None) -> C
     return Consistency(dense.misfit, scattered, tuple(breaches), None if late is None else late[0])
 
 
-def without_instrument(sweep: Sweep) -> Sweep:
+def without_instrument(sweep: Sweep, highest: float | None = None) -> Sweep:
     """Return the sweep without the points at high frequencies that show the inertia of the instrument. These points
     are moved to `grey`, and a note reports them.
 
     The search is repeated with the remaining points until the inertia is no longer found. Only the last half decade of
-    the sweep is searched.
+    the sweep is searched. `highest`: highest frequency [rad/s] of all sweeps of a master curve. The note gives it as
+    the limit that keeps all points. None: there is only this sweep.
     """
     here, end = sweep, sweep.angular_frequency[-1] / math.sqrt(10)
     told = ""
@@ -84,7 +85,7 @@ def without_instrument(sweep: Sweep) -> Sweep:
     lost = sweep.angular_frequency > here.angular_frequency[-1]
     if not lost.any():
         return sweep
-    low, high = (omega / (2 * np.pi) for omega in (here.angular_frequency[-1], sweep.angular_frequency[-1]))
+    low, high = (omega / (2 * np.pi) for omega in (here.angular_frequency[-1], highest or sweep.angular_frequency[-1]))
     note = (
         f"{lost.sum()} of {len(lost)} points above {low:.4g} Hz {'is' if lost.sum() == 1 else 'are'} ignored. Reason: "
         f"{told}, which is the mark of the instrument. The inertia of the instrument adds a term that grows as "

@@ -5,6 +5,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+import scipy.special
 
 from fitting.readers import raw_torque
 from fitting.readers.tables.text_tables import without_multiples
@@ -39,26 +40,22 @@ class Sweep(NamedTuple):
     sd_before: bool = False  # True: the sd belong to the moduli before a correction, and are only weights
     sweep_numbers: np.ndarray | None = None  # (n,) number of the sweep of each point, if several sweeps are joined
     load: str = "shear"  # how the sample was loaded: shear, tension (or compression), bending; all moduli are of shear
+    table: str = ""  # name of the table in the file
+    files: tuple[str, ...] = ()  # all files of joined sweeps; `source` names only the first of them
 
     @property
     def deviations(self) -> tuple[np.ndarray, np.ndarray]:
         """Scales [Pa] of the residuals of G' and G'': the given standard deviations, or else smooth curves through the
         moduli (the residuals are then relative).
 
-        Standard deviations that were estimated from few repeats are smoothed, separately in each of several joined
-        sweeps.
+        Standard deviations that were estimated from few repeats are smoothed (`deviations_of_sweeps`).
         """
         omega, pairs = self.angular_frequency, ((self.storage, self.storage_sd), (self.loss, self.loss_sd))
         numbers = np.zeros(len(omega), int) if self.sweep_numbers is None else self.sweep_numbers
-        each = [numbers == k for k in np.unique(numbers)]
-        scales = []
-        for modulus, sd in pairs:
-            if sd is None:
-                scales.append(smooth_curve(omega, modulus))
-                continue
-            scales.append(np.empty(len(omega)))
-            for own in each:
-                scales[-1][own] = smooth_deviations(omega[own], modulus[own], sd[own])
+        scales = [
+            smooth_curve(omega, modulus) if sd is None else deviations_of_sweeps(omega, modulus, sd, numbers)
+            for modulus, sd in pairs
+        ]
         return scales[0], scales[1]
 
     @property
@@ -230,6 +227,41 @@ def _far_from_neighbours(y: np.ndarray) -> np.ndarray:
 _FEW_REPEATS, _POINTS, _DEGREE = 0.25, 8, 2
 #: If ln(deviation / modulus) varies by less than this, the deviations are a fixed percentage of the moduli.
 _ROUNDED = 0.01
+#: The relative deviations of short sweeps differ if the probability of the same differences by chance is below this.
+_BY_CHANCE = 1e-3
+
+
+def deviations_of_sweeps(omega: np.ndarray, modulus: np.ndarray, sd: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    """Return smooth standard deviations (n,) of joined sweeps. `numbers` (n,): number of the sweep of each point.
+
+    Each sweep with `_POINTS` or more frequencies is smoothed separately. A shorter sweep has too few points for this,
+    so all shorter sweeps are smoothed together, after a division by the level of each sweep (`_levels_of_sweeps`).
+    """
+    out, short = np.empty(len(omega)), np.zeros(len(omega), bool)
+    for k in np.unique(numbers):
+        own = numbers == k
+        if len(np.unique(omega[own])) < _POINTS:
+            short |= own
+        else:
+            out[own] = smooth_deviations(omega[own], modulus[own], sd[own])
+    if short.any():
+        level = _levels_of_sweeps(np.log(sd / modulus)[short], numbers[short])
+        out[short] = level * smooth_deviations(omega[short], modulus[short], sd[short] / level)
+    return out
+
+
+def _levels_of_sweeps(part: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    """Return the level (n,) of the relative standard deviations in the sweep of each point. All levels are 1 if the
+    sweeps do not differ more than by chance (F-test). `part`: logarithms (n,) of the relative standard deviations."""
+    place = np.unique(numbers, return_inverse=True)[1]
+    means = (np.bincount(place, part) / np.bincount(place))[place]
+    more, freedom = int(place.max()), len(part) - int(place.max()) - 1
+    if more < 1 or freedom < 1:
+        return np.ones(len(part))
+    within_sweeps = max(float(np.sum((part - means) ** 2)), np.finfo(float).eps)  # not zero
+    ratio = float(np.sum((means - part.mean()) ** 2)) / more / (within_sweeps / freedom)
+    differ = scipy.special.fdtrc(more, freedom, ratio) < _BY_CHANCE
+    return np.exp(means - part.mean()) if differ else np.ones(len(part))
 
 
 def smooth_deviations(omega: np.ndarray, modulus: np.ndarray, sd: np.ndarray) -> np.ndarray:
@@ -272,11 +304,11 @@ def mostly_repeated(omega: np.ndarray) -> bool:
     return bool(np.median(np.unique(omega, return_counts=True)[1]) >= 2)
 
 
-def within(sweep: Sweep, low: float | None, high: float | None) -> Sweep:
+def within(sweep: Sweep, low: float | None, high: float | None, fewest: int = FEWEST) -> Sweep:
     """Return the sweep with only the points from `low` to `high` [Hz]. A note reports how many points are ignored.
 
     Raises:
-        InputError: fewer than `FEWEST` frequencies remain.
+        InputError: fewer than `fewest` frequencies remain.
     """
     hertz = sweep.angular_frequency / (2 * np.pi)
     kept = np.ones(len(hertz), bool)
@@ -288,10 +320,10 @@ def within(sweep: Sweep, low: float | None, high: float | None) -> Sweep:
         kept &= side * hertz <= side * limit * (1 + side * 1e-9)
     if kept.all():
         return sweep
-    if len(np.unique(hertz[kept])) < FEWEST:
+    if len(np.unique(hertz[kept])) < fewest:
         raise InputError(
             f"{sweep.source or 'sweep'}: --min-frequency and --max-frequency keep only {kept.sum()} of {len(kept)} "
-            f"points (the file has {hertz[0]:.3g} to {hertz[-1]:.3g} Hz); keep {FEWEST} frequencies or more"
+            f"points (the file has {hertz[0]:.3g} to {hertz[-1]:.3g} Hz); keep {fewest} or more frequencies"
         )
     ends = " and ".join(
         f"{word} {limit:g} Hz" for word, limit in (("below", low), ("above", high)) if limit is not None
@@ -337,12 +369,17 @@ def with_friction(sweep: Sweep, error: float, radius: float, height: float) -> S
     return sweep._replace(friction=error * sweep.angular_frequency / geometry, friction_error=error)
 
 
-def without_inertia(sweep: Sweep, radius: float | None = None, height: float | None = None) -> Sweep:
+def without_inertia(
+    sweep: Sweep, radius: float | None = None, height: float | None = None, fewest: int = FEWEST
+) -> Sweep:
     """Return the sweep without the points at which the instrument's inertia dominates: there, the uncertainty of the
     inertia's contribution [Pa] exceeds the modulus. These points become `grey`.
 
     The inertia is found from raw torque and raw angle, with the torque of the sample or its `radius` and `height` [m].
     If these columns do not show the inertia, the inertia is found from the raw phase.
+
+    Raises:
+        InputError: fewer than `fewest` frequencies remain.
     """
     raw = sweep.raw
     if not raw or not set(raw_torque.COLUMNS) & set(raw):
@@ -371,19 +408,13 @@ def without_inertia(sweep: Sweep, radius: float | None = None, height: float | N
     if np.isfinite(found.inertia):
         shows = f"torque shows an instrument inertia of {1e6 * found.inertia:.4g} uN m s^2"
     times = found.modulus[k] / np.abs(G[k])
-    empty = int(np.sum(~raw_torque.with_raw_columns(raw)))
-    if empty:
-        shows += (
-            f" ({empty} of {len(G)} points have an empty cell in the raw columns, or a torque or displacement of 0: "
-            "for these points, the inertia of the other points is used)"
-        )
     note = (
-        f"the raw {shows}; at {omega[k] / (2 * np.pi):.3g} Hz, the torque for the inertia is {times:.3g} times the "
-        "torque of the sample"
+        f"the raw {shows}{_points_without_raw_values(raw)}; at {omega[k] / (2 * np.pi):.3g} Hz, the torque for the "
+        f"inertia is {times:.3g} times the torque of the sample"
     )
     if not lost.any():
         return sweep._replace(notes=(*sweep.notes, note))
-    if len(np.unique(sweep.angular_frequency[~lost])) < FEWEST:
+    if len(np.unique(sweep.angular_frequency[~lost])) < fewest:
         raise InputError(
             f"{sweep.source}: {note}: the instrument dominates at nearly all points; measure at lower frequencies"
         )
@@ -395,3 +426,14 @@ def without_inertia(sweep: Sweep, radius: float | None = None, height: float | N
     )
     grey = np.column_stack([sweep.angular_frequency, sweep.storage, sweep.loss])[lost]
     return some(sweep, ~lost)._replace(notes=(*sweep.notes, note, left), grey=grey)
+
+
+def _points_without_raw_values(raw: dict[str, np.ndarray]) -> str:
+    """Return words on the points without a value in one of the raw columns. Empty if there are no such points."""
+    known = raw_torque.with_raw_columns(raw)
+    if known.all():
+        return ""
+    return (
+        f" ({np.sum(~known)} of {len(known)} points have an empty cell in the raw columns, or a torque or displacement "
+        "of 0: for these points, the inertia of the other points is used)"
+    )

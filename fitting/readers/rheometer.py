@@ -184,7 +184,8 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
         notes.append(SORTED)
     get: Content = {q: values[q][order] if q in values else None for q in ("storage", "loss", "storage_sd", "loss_sd")}
     raw = {q: v[good][order] for q, v in table.raw.items()}
-    found = without_copies(Sweep(omega[order], **get, source=path, notes=tuple(notes), raw=raw or None, load=load))
+    found = Sweep(omega[order], **get, source=path, notes=tuple(notes), raw=raw or None, load=load, table=table.name)
+    found = without_copies(found)
     repeated = len(found.storage) - len(np.unique(omega))
     if repeated:
         found = found._replace(notes=(*found.notes, f"repeated frequencies: {repeated}. {REPEATED}"))

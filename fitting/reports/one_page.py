@@ -40,9 +40,10 @@ def page(sweep: Sweep, fits: list[Fit], content: Content, first: str = "") -> "F
     top = figure.add_subplot(grid[0, 0])
     sweep_report.draw_moduli(top, figure.add_subplot(grid[1, 0], sharex=top), sweep, fits)
     sweep_report.draw_time_constants(figure.add_subplot(grid[:, 1]), sweep, fits, 1)
-    names = ", ".join(Path(source).name for source in sweep.source.split(", "))  # of several files for a master curve
-    names = names[: CHARACTERS // 2] or "sweep"
-    figure.suptitle(f"{names}: {content['model']}, {content['method']}", fontsize=11, y=0.975)
+    name = Path(sweep.source).name or "sweep"
+    if len(name) > CHARACTERS // 2:
+        name = f"{name[: CHARACTERS // 2 - 1]}…"
+    figure.suptitle(f"{name}: {content['model']}, {content['method']}", fontsize=11, y=0.975)
     lines = text_of_page(sweep, fits, content, first)
     size = min(SIZE, 72 * HEIGHT * (TEXT - 0.5 * MARGIN) / (1.25 * len(lines)))
     figure.text(MARGIN, TEXT - 0.01, "\n".join(lines), family="monospace", fontsize=size, va="top", linespacing=1.2)

@@ -185,7 +185,8 @@ def write(
     there is a posterior, fit.json contains its summary, and posterior.csv contains its draws."""
     out.mkdir(parents=True, exist_ok=True)
     main = fits[-1]
-    content = summary(main, sweep) | {"data": sweep.source, "notes": list(sweep.notes), "versions": versions()}
+    data = ", ".join(sweep.files) or sweep.source
+    content = summary(main, sweep) | {"data": data, "notes": list(sweep.notes), "versions": versions()}
     content["moduli"] = moduli_rows(fits[0], sweep)
     content["band_sensitivity"] = band_sensitivity(fits[0])
     whole = total_error.total_errors(main)

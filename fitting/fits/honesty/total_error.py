@@ -23,7 +23,7 @@ def of_geometry(simulation: Simulation, gap_error: float | None, axial: bool = F
     """Return the relative error of all moduli due to the size of the sample between the plates.
 
     Torque divided by twist is G pi R^4 / (2 h) for the shear modulus G, the radius R and the gap h. Force divided by
-    displacement is 3 G pi R^2 / h.
+    displacement is 3 G pi R^2 / h. The stiffness of a bent rod also contains R^4.
 
     Args:
         simulation: the radius and the gap.
