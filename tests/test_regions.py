@@ -193,6 +193,9 @@ def test_bounds_and_points_on_a_face_are_found_in_single_precision():
         assert len(select_elements(rounded, {"z_min": 0.06}, None)) == 900
     fine = lj.shapes.box((0.3, 0.3, 0.3), (100, 1, 1))  # a bound just beside a layer of nodes selected this layer
     assert len(lj.boundary.select(fine, {"x_min": 1e-6})) == 400
+    single = [np.float32(units * np.asarray(fine.points)).astype(float) / units for units in (1.0, 1e3)]
+    for mesh, number in ((fine, 400), *((lj.tet_mesh(points, fine.tetrahedra), 404) for points in single)):
+        assert len(lj.boundary.select(mesh, {"x_min": 1e-8})) == number  # exact coordinates: within 1e-9 of the size
     elements_at(rounded, np.array([[0.1, 0.05, 0.12], [0.2, 0.1, 0.12]]), "points")
     with pytest.raises(lj.InputError, match="outside the body"):
         elements_at(rounded, np.array([[0.1, 0.05, 0.12001]]), "points")

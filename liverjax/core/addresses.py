@@ -43,6 +43,7 @@ MOVED = {
     "fitting.prony": "fitting.methods.generalised_maxwell",
     "fitting.report": "fitting.reports.sweep_report",
     "fitting.rheometer": "fitting.readers.rheometer",
+    "fitting.rigs": "fitting.rigs",
     "fitting.scenes": "fitting.fits.scene_numbers",
     "fitting.stress_stretch": "fitting.fits.stress_stretch",
     "fitting.torsion": "fitting.rigs.torsion",

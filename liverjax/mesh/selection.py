@@ -9,7 +9,7 @@ from liverjax.core.bounds import finite
 from liverjax.core.did_you_mean import as_word, hint
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Indices
-from liverjax.mesh.tetrahedra import FACES, SINGLE_PRECISION, TetMesh, roundoff_of
+from liverjax.mesh.tetrahedra import FACES, TetMesh, tolerance_of_bounds
 
 AXES = "xyz"
 #: A bound may be in millimetres if it is larger than this multiple of the largest coordinate of the mesh.
@@ -23,8 +23,8 @@ def select(
 
     Args:
         mesh: `TetMesh`.
-        where: name of a bound (x_min, x_max, y_min, …) -> value [m]. Nodes on a bound are selected too, even if
-            their coordinates have only single precision (`roundoff_of`).
+        where: name of a bound (x_min, x_max, y_min, …) -> value [m]. Nodes on a bound are selected too, with the
+            tolerance `tolerance_of_bounds`.
         set: name of a node set.
         name: name of the condition, for messages.
 
@@ -47,7 +47,7 @@ def select(
     if not isinstance(where, Mapping):
         raise InputError(f"{name} = {where!r} is not a table of bounds: write where = {{z_max = 0.0}}")
     points = np.asarray(mesh.points)
-    tolerance = roundoff_of(mesh, SINGLE_PRECISION)
+    tolerance = tolerance_of_bounds(mesh)
     inside = np.ones(len(points), dtype=bool)
     known = [f"{a}_{end}" for a in AXES for end in ("min", "max")]
     for key, bound in where.items():

@@ -310,6 +310,17 @@ def roundoff_of(mesh: TetMesh, relative: float = SIX_DIGITS) -> float:
     return float(max(1e-9 * size, min(relative * np.abs(points).max(), OF_AN_EDGE * shortest)))
 
 
+def tolerance_of_bounds(mesh: TetMesh) -> float:
+    """Return the distance [m] from a bound at which a node still lies on the bound: 1e-9 of the mesh's size.
+
+    If the file gave the coordinates in single precision, in m, cm or mm, it is the roundoff of this precision.
+    """
+    points = np.asarray(mesh.points, float)
+    rounded = [np.float64(np.float32(units * points)) / units for units in (1.0, 1e2, 1e3)]
+    single = any(bool(np.all(np.abs(r - points) <= 1e-15 * np.abs(points))) for r in rounded)
+    return roundoff_of(mesh, SINGLE_PRECISION if single else 0.0)
+
+
 #: The faces of a tetrahedron, counterclockwise if seen from outside.
 FACES = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))
 

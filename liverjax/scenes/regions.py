@@ -11,7 +11,7 @@ from liverjax.core.did_you_mean import as_word
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content, Indices, Numbers, param, struct
 from liverjax.laws import Law
-from liverjax.mesh.tetrahedra import SINGLE_PRECISION, TetMesh, roundoff_of
+from liverjax.mesh.tetrahedra import TetMesh, tolerance_of_bounds
 from liverjax.physics import boundary
 
 #: Parameters of viscosity and porosity that may differ in a region.
@@ -74,7 +74,7 @@ _APART = 0.02
 def _warn_of_cut_elements(mesh: TetMesh, elements: np.ndarray, where: dict[str, float], name: str) -> None:
     """Warn if a bound of `where` cuts elements. The region does not contain cut elements, so it is too small."""
     points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
-    tolerance = roundoff_of(mesh, SINGLE_PRECISION)
+    tolerance = tolerance_of_bounds(mesh)
     inside = {
         key: (points[:, "xyz".index(key[0])] - bound) * (1 if key.endswith("min") else -1) >= -tolerance
         for key, bound in where.items()
@@ -137,13 +137,15 @@ def law_number(law: Law, name: str) -> jax.Array:
     """Return the value that the parameter `name` has in the law of the scene. A region changes this parameter.
 
     Raises:
-        InputError: the law has no parameter with this name, or the name belongs to a list of parameters.
+        InputError: the law has no parameter with this name, or the name belongs to a list of parameters or to a law.
     """
     value = names.get(law, name, refused_name(name))
     if isinstance(value, tuple):
         raise InputError(
             f"region: {name} is a list of {len(value)} values: name one of these values, for example {name}.0"
         )
+    if isinstance(value, Law):
+        raise InputError(f"region: {name} is a law with several parameters: name one of them, for example {name}.mu")
     return value
 
 
