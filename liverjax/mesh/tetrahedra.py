@@ -316,8 +316,13 @@ def tolerance_of_bounds(mesh: TetMesh) -> float:
     If the file gave the coordinates in single precision, in m, cm or mm, it is the roundoff of this precision.
     """
     points = np.asarray(mesh.points, float)
-    rounded = [np.float64(np.float32(units * points)) / units for units in (1.0, 1e2, 1e3)]
-    single = any(bool(np.all(np.abs(r - points) <= 1e-15 * np.abs(points))) for r in rounded)
+
+    def are(rounded: np.ndarray) -> bool:
+        return bool(np.all(np.abs(rounded - points) <= 1e-15 * np.abs(points)))
+
+    # Decimal numbers of few digits may also be exact in single precision. They have no roundoff.
+    short = are(np.round(points, 9))
+    single = not short and any(are(np.float64(np.float32(units * points)) / units) for units in (1.0, 1e2, 1e3))
     return roundoff_of(mesh, SINGLE_PRECISION if single else 0.0)
 
 
