@@ -22,11 +22,10 @@ from liverjax.physics.porosity import Inlet
 from liverjax.physics.prescribed import free_degrees
 from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene_file import scene_from
-from liverjax.scenes.springpots import springpot_factors
+from liverjax.scenes.springpots import check_spring_at_rest, springpot_factors
 from liverjax.simulation.equations import forces_at
 from liverjax.simulation.run import prepared
 from liverjax.simulation.unloaded import cautions_of_loaded, resting
-from liverjax.waves import rest
 from liverjax.waves.harmonic import _small
 from liverjax.waves.rest import under_its_weight
 
@@ -181,7 +180,7 @@ def test_a_springpot_with_exponent_0_is_a_spring_at_rest(limits):
     for spring in (0.0, 0.5):
         own = lj.SpringpotSeries(times=[1.0, 1.0], exponents=jnp.array([0.0, 0.5]), limits=limits, spring=spring)
         scene = lj.Scene(mesh=mesh, law=law, springpots=own)
-        rest._check_spring(scene)
+        check_spring_at_rest(own, "or do nothing")
         factor = spring + (1.0 if limits is None else 0.8)
         np.testing.assert_allclose(resting(scene).law.mu, factor * 2000.0, rtol=1e-12)
         np.testing.assert_allclose(springpot_factors(own, jnp.array([1e-14])), factor, atol=1e-6)
@@ -189,11 +188,10 @@ def test_a_springpot_with_exponent_0_is_a_spring_at_rest(limits):
 
 def test_a_springpot_without_spring_is_refused_inside_jit_too():
     """The stiffness at rest was computed with jnp. Inside jit it was a tracer, so it was not checked."""
-    mesh = lj.shapes.box((0.02, 0.02, 0.02), (1, 1, 1))
 
     def check(mu, exponents):
         own = lj.SpringpotSeries(times=[1.0], exponents=exponents, spring=0.0)
-        rest._check_spring(lj.Scene(mesh=mesh, law=lj.laws.NeoHookean(mu=mu, bulk=20000.0), springpots=own))
+        check_spring_at_rest(own, "or do nothing")
         return mu
 
     with pytest.raises(lj.InputError, match=r"springpots.spring = 0 leaves no shear stiffness at rest"):
@@ -282,7 +280,7 @@ def test_a_loaded_mesh_is_unloaded_before_harmonic_motion():
         "solve": {"kind": "harmonic", "frequencies": [5.0], "tolerance": 1e-10},
     }
     scene = scene_from(table)
-    with pytest.raises(lj.InputError, match=r"use the scene of lj.unloaded\(scene\)"):
+    with pytest.raises(lj.InputError, match=r"use the scene of lj.unloaded\(scene\).*use vtu/step_00001.vtu"):
         lj.harmonic(scene)
     found = lj.unloaded(scene)
     given, points = np.asarray(scene.mesh.points), np.asarray(found.scene.mesh.points)
@@ -294,6 +292,21 @@ def test_a_loaded_mesh_is_unloaded_before_harmonic_motion():
     assert np.abs(force).max() < 1e-8 * np.abs(whole).max()
     with pytest.raises(lj.InputError, match="kind = 'harmonic' has no time steps"):
         lj.simulate(found.scene)
+
+
+def test_a_loaded_body_without_stiffness_at_rest_needs_a_spring():
+    """lj.unloaded advised to use a stiffer law, which does not help."""
+    mesh = lj.shapes.box((0.02, 0.02, 0.02), (1, 1, 1))
+    scene = lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=800.0, bulk=4000.0),
+        springpots=lj.SpringpotSeries(times=[0.01], exponents=[0.3], spring=0.0),
+        body=lj.Body(density=1000.0, gravity=(0.0, 0.0, -1.0)),
+        fixed=(lj.Fixed(nodes=mesh.node_sets["x_min"]),),
+        solve=lj.Solve(kind="harmonic", frequencies=[5.0]),
+    )
+    with pytest.raises(lj.InputError, match=r"no shear stiffness at rest.* spring above 0, or remove the gravity$"):
+        lj.unloaded(scene)
 
 
 def test_a_run_of_single_solves_that_is_not_in_equilibrium_is_refused(tmp_path):

@@ -305,12 +305,19 @@ def test_the_terms_of_the_chapter_know_the_continued_volume():
 
 
 def test_a_modulus_in_another_unit_than_pascal_is_refused():
-    """`scaled` did not multiply a modulus in kPa, so such a law did not relax."""
+    """`scaled` did not multiply a modulus in kPa, so such a law did not relax. Later, such a unit was refused in every
+    struct."""
     with pytest.raises(lj.InputError, match=r"Soft\.mu has the unit 'kPa': declare the unit Pa"):
 
         @lj.struct
         class Soft(lj.Law):
             mu: float = lj.param("kPa", typical=0.77)
+
+    @lj.struct
+    class Vessel:
+        pressure: float = lj.param("mmHg", default=80.0)
+
+    assert Vessel().pressure == 80.0  # only laws are multiplied, so other structs may have any unit
 
 
 def test_a_law_of_ogden_without_terms_is_refused():

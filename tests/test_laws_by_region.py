@@ -11,7 +11,9 @@ import scipy.optimize
 import liverjax as lj
 from liverjax.core.struct import replace
 from liverjax.elements import mjed, projection, reference
+from liverjax.jobs.sweep import read_sweep
 from liverjax.scenes.by_element import law_of_elements
+from liverjax.scenes.checks import numbers as number_checks
 from liverjax.scenes.scene import with_parameters
 from liverjax.scenes.scene_file import scene_from
 from liverjax.simulation.run import prepared
@@ -378,11 +380,42 @@ def test_a_negative_shear_modulus_is_refused_only_if_the_whole_law_has_it():
     soft, top = {"name": "bogen", "mu": -400.0, "alpha": 4.0, "bulk": 7700.0}, {"where": {"z_min": 0.5}}
     scene_from(content)
     scene_from(content | {"law": [{"name": "neo_hookean", "mu": 900.0, "bulk": 7700.0}, soft]})
-    for wrong in (
-        {"law": soft},
-        {"law": [{"name": "neo_hookean", "mu": 700.0, "bulk": 7700.0}, soft]},
-        {"region": [top | {"law": {"c10": 50.0}}]},
-        {"region": [top | {"law": soft}]},
+    bottom = {"where": {"z_max": 0.5}, "law": {"c10": 400.0}}
+    for wrong, name in (
+        ({"law": soft}, "law"),
+        ({"law": [{"name": "neo_hookean", "mu": 700.0, "bulk": 7700.0}, soft]}, "law"),
+        ({"law": content["law"] | {"c10": 50.0}, "region": [top | {"law": {"bulk": 9000.0}}]}, "law"),
+        ({"region": [top | {"law": {"c10": 50.0}}]}, "region.0: law"),
+        ({"region": [bottom, top | {"law": soft}]}, "region.1: law"),
     ):
-        with pytest.raises(lj.InputError, match="must not be negative: change its parameters"):
+        with pytest.raises(lj.InputError, match=f"^{name} has .* must not be negative: change its parameters"):
             scene_from(content | wrong)
+
+
+def test_a_sweep_checks_the_regions_once_and_the_stiffness_only_if_a_law_changes(tmp_path, monkeypatch):
+    """Each row checked the elements of all regions and the stiffness again."""
+    (tmp_path / "scene.toml").write_text(
+        'mesh = {shape = "box", size = [1.0, 1.0, 1.0], cells = [1, 1, 2]}\n'
+        'law = {name = "mooney_rivlin", c10 = 300.0, c01 = -85.0, bulk = 7700.0}\n'
+        "fixed = [{where = {z_max = 0.0}}]\nbody = {density = 1000.0, gravity = [0.0, 0.0, -1.0]}\n"
+        "[[region]]\nwhere = {z_min = 0.5}\nlaw = {c10 = 400.0}\n"
+    )
+    counts = dict.fromkeys(("check_region_elements", "_least_shear_modulus"), 0)
+
+    def counted(name, check):
+        def run(*given):
+            counts[name] += 1
+            return check(*given)
+
+        return run
+
+    for name in counts:
+        monkeypatch.setattr(number_checks, name, counted(name, getattr(number_checks, name)))
+    for column, values, stiffness in (("body.density", "1\n2", 1), ("region.0.law.c10", "300\n350", 3)):
+        counts.update(dict.fromkeys(counts, 0))
+        (tmp_path / "rows.csv").write_text(f"{column}\n{values}\n")
+        read_sweep(tmp_path / "scene.toml", tmp_path / "rows.csv")
+        assert counts == {"check_region_elements": 1, "_least_shear_modulus": stiffness}
+    (tmp_path / "rows.csv").write_text("region.0.law.c10\n300\n50\n")
+    with pytest.raises(lj.InputError, match=r"row 2: region\.0: law has a shear modulus"):
+        read_sweep(tmp_path / "scene.toml", tmp_path / "rows.csv")

@@ -118,6 +118,13 @@ def _stop_after(monkeypatch, count: int) -> None:
     monkeypatch.setattr(resumable_parts, "write", until)
 
 
+def test_an_unfinished_run_needs_the_same_number_of_steps_per_part(tmp_path):
+    """The message advised only --resume, which refuses parts of another number of steps."""
+    (tmp_path / "result.h5.parts").mkdir()
+    with pytest.raises(lj.InputError, match="continue with --resume and the same --every, or remove this folder"):
+        long_run.refuse_unfinished(tmp_path / "result.h5", False)
+
+
 @pytest.mark.ci
 def test_a_stopped_run_goes_on_to_the_same_numbers(scene, tmp_path, monkeypatch, capsys):
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
@@ -129,7 +136,7 @@ def test_a_stopped_run_goes_on_to_the_same_numbers(scene, tmp_path, monkeypatch,
         assert "stopped; continue with --resume" in capsys.readouterr().err
     assert not (stopped / "result.h5").exists()
     assert main([*command, str(stopped)]) == 2
-    assert "unfinished run: continue with --resume" in capsys.readouterr().err
+    assert "unfinished run: continue with --resume and the same --every" in capsys.readouterr().err
     # as if the machine had lost power while the file was written
     damaged = sorted(stopped.glob("result.h5.parts/part_*.h5"))[1]
     damaged.write_bytes(damaged.read_bytes()[:-1000])

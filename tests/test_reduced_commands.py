@@ -109,7 +109,27 @@ def test_a_model_is_not_written_over_another_file(name, tmp_path, monkeypatch, c
     monkeypatch.setattr(reduction, "reduce_scene", lambda *_, **__: pytest.fail("the runs begin"))
     arguments = [str(tmp_path / "scene.toml"), str(tmp_path / "row.csv"), "--out", str(tmp_path / name)]
     assert main(["reduce", *arguments]) == 2 and (tmp_path / name).read_text() == before
-    assert "exists, and is not a reduced model: name another file" in capsys.readouterr().err
+    assert "exists, and is not a reduced model: name another file for the model, or remove" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("names", [("modes", "weights"), ("modes",)])
+def test_an_incomplete_model_may_be_replaced(names, tmp_path, monkeypatch):
+    """`simulate` advised to make the model again, but `reduce` refused to replace it. Another HDF5 file stays."""
+    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "row.csv").write_text("law.mu\n800\n")
+    with h5py.File(tmp_path / "model.h5", "w") as file:
+        for name in names:
+            file[name] = [1.0]
+    begun = []
+    monkeypatch.setattr(reduction, "reduce_scene", lambda *_, **__: begun.append(1))
+    monkeypatch.setattr(reduction, "save_reduced", lambda *_: None)
+    reduction_of = (tmp_path / "scene.toml", tmp_path / "row.csv", tmp_path / "model.h5", 0.01, 5)
+    if len(names) == 2:
+        reduction.make(*reduction_of)
+    else:
+        with pytest.raises(lj.InputError, match="or remove this file"):
+            reduction.make(*reduction_of)
+    assert len(begun) == len(names) - 1
 
 
 def test_the_command_tells_the_path_of_the_model_from_the_scene(tmp_path, monkeypatch, capsys):

@@ -21,8 +21,6 @@ Numbers = Number | Sequence[float] | Sequence[Sequence[float]]
 Array = np.ndarray | jax.Array
 #: Index numbers of nodes, elements or triangles.
 Indices = Array
-#: Units of a modulus that a field must not have. Functions that multiply the moduli of a law look for the unit Pa.
-_NOT_PASCAL = frozenset(("hPa", "kPa", "MPa", "GPa", "N/m^2", "N/m2", "N/mm^2", "N/mm2", "bar", "mbar", "psi", "mmHg"))
 #: A table of a TOML file, or the content of a JSON file. Its values are checked when they are used.
 Content = dict[str, Any]
 
@@ -60,8 +58,8 @@ def param(
     """Declare a numeric field, which is a leaf of the pytree.
 
     Args:
-        unit: SI unit, ``"1"`` for a pure number. `liverjax.laws.scaled` multiplies all fields in ``Pa``, so `struct`
-            refuses other units of pressure.
+        unit: SI unit, ``"1"`` for a pure number. `liverjax.laws.scaled` multiplies all fields in ``Pa``, so a law
+            must not have another unit of pressure.
         about: one line for ``python -m liverjax laws``.
         each: whether the value is a sequence: one number for each term of a law, or the components of a direction.
             The struct keeps an array (n,) as a tuple; `jnp.stack` makes it an array again.
@@ -99,18 +97,9 @@ def unnamed(about: str = "", *, places: str = "", default: object = dataclasses.
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(static, param, unnamed))
 def struct(cls: type[T]) -> type[T]:
-    """Make `cls` a frozen, keyword-only dataclass that is registered as a pytree. `static` fields are not leaves.
-
-    Raises:
-        InputError: a field has a unit of pressure other than Pa.
-    """
+    """Make `cls` a frozen, keyword-only dataclass that is registered as a pytree. `static` fields are not leaves."""
     made: Any = dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)
     fields = dataclasses.fields(made)
-    for field in fields:
-        if (unit := field.metadata.get("unit")) in _NOT_PASCAL:
-            raise InputError(
-                f"{cls.__name__}.{field.name} has the unit {unit!r}: declare the unit Pa, with values in Pa"
-            )
     several = frozenset(f.name for f in fields if f.metadata.get("each"))
     arrays = {f.name for f in fields} & (_WHOLE | _FLOATING) - several
     if arrays:

@@ -49,7 +49,9 @@ def refuse_unfinished(out: Path, resume: bool, text: str | None = None) -> None:
     """
     folder = resumable_parts.beside(out)
     if folder.exists() and not resume:
-        raise InputError(f"{folder} contains an unfinished run: continue with --resume, or remove this folder")
+        raise InputError(
+            f"{folder} contains an unfinished run: continue with --resume and the same --every, or remove this folder"
+        )
     if resume and not folder.exists() and out.exists() and text is not None:
         try:
             with h5py.File(out) as file:

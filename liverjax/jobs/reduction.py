@@ -1,9 +1,11 @@
 """Reduced models of scene files: make a model from training runs, and use it for a run if the error is small."""
 
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
+import h5py
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -68,13 +70,18 @@ def make(
 
 
 def _refuse_other_content(out: Path) -> None:
-    """Raise `InputError` if a file `out` exists and is no reduced model, for example the scene file."""
+    """Raise `InputError` if a file `out` exists and is no reduced model, for example the scene file.
+
+    A damaged or incomplete model may be replaced if its modes and weights can be found.
+    """
     if not out.exists():
         return
-    try:
-        load_reduced(out)
-    except InputError:
-        raise InputError(f"--out {out} exists, and is not a reduced model: name another file for the model") from None
+    with suppress(OSError), h5py.File(out, "r") as stored:  # OSError: this is not an HDF5 file
+        if "modes" in stored and "weights" in stored:
+            return
+    raise InputError(
+        f"--out {out} exists, and is not a reduced model: name another file for the model, or remove this file"
+    )
 
 
 def tried(scene: Scene) -> Tried:

@@ -120,7 +120,7 @@ def read_sweep(
         try:
             own = with_parameters(scene, values)
             check_choices(own)
-            check_numbers(own)
+            check_numbers(own, parts)
             check_physics(own, parts)
             check_motion_in_planes(own)
             check_hold(own, held)

@@ -16,6 +16,7 @@ Derivatives are computed by scalar automatic differentiation, unless the law def
 `stretch_derivatives`, `green_derivatives` or `energy_derivatives`.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -34,9 +35,20 @@ from liverjax.tensors.matrices import (
     unpack,
 )
 
+#: Units that a parameter of a law must not have. Functions that multiply the moduli of a law look for the unit Pa.
+_NOT_PASCAL = frozenset(("hPa", "kPa", "MPa", "GPa", "N/m^2", "N/m2", "N/mm^2", "N/mm2", "bar", "mbar", "psi", "mmHg"))
+
 
 class Law(Energies):
     """A hyperelastic law: energy per reference volume [Pa]. The module's docstring lists the methods to override."""
+
+    def __init_subclass__(cls) -> None:
+        """Raise `InputError` if a parameter of a new law has a unit of pressure other than Pa."""
+        super().__init_subclass__()
+        for name, field in vars(cls).items():
+            unit = field.metadata.get("unit") if isinstance(field, dataclasses.Field) else None
+            if unit in _NOT_PASCAL:
+                raise InputError(f"{cls.__name__}.{name} has the unit {unit!r}: declare the unit Pa, with values in Pa")
 
     def shear_modulus(self) -> Any:
         """Return the ground-state shear modulus [Pa]. Raise `InputError` if the law does not define this method."""

@@ -95,10 +95,11 @@ class Continued(Law):
 
 
 def continued(law: Law, below: float) -> Law:
-    """Return the law with an energy that is defined for every J. It is the same law above J = `below` (`Continued`).
+    """Return the law with an energy that is defined for every J in exact arithmetic (see `Continued`).
 
-    Below c, the isochoric invariants grow while J decreases. So an exponential of them can exceed the largest
-    floating-point number, for example in float32 at J = -1. Energy and forces are then infinite or NaN.
+    Above J = `below` it is the same law. Below c, the isochoric invariants grow while J decreases. So an exponential of
+    them can exceed the largest floating-point number, for example in float32 at J = -1. Energy and forces are then
+    infinite or NaN.
 
     Args:
         law: a law of I1, I2 and J, or a sum of such laws.

@@ -25,7 +25,8 @@ from liverjax.scenes.scene import Scene, named_physics
 
 def check_before_run(scene: Scene) -> None:
     """Check choices, bounds of numbers, nodes, regions and the objects in `scene.physics`. Arrays inside jit are not
-    checked. The check compiles nothing.
+    checked. The check compiles nothing. The shear modulus of the law is not computed: call `check_scene` to
+    refuse a negative one.
 
     Raises:
         InputError: see `check_choices` and `check_bounds`; a node is not in the mesh; an element is inverted; a node is

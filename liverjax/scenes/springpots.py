@@ -61,6 +61,27 @@ def check_springpots(own: SpringpotSeries, law: Law, viscosity: Prony | None) ->
     check_part(own.part, law, "springpots")
 
 
+def check_spring_at_rest(own: SpringpotSeries | None, otherwise: str) -> None:
+    """Check that spring and springpots leave a shear stiffness at rest. Numbers inside jit, grad or vmap are not
+    checked.
+
+    Args:
+        own: the springpots; None is always right.
+        otherwise: what the user can do instead of a larger spring. It is the end of the error message.
+
+    Raises:
+        InputError: the spring is 0, and no springpot has the exponent 0.
+    """
+    if own is None or any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((own.spring, own.exponents))):
+        return
+    # Inside jit, jnp makes tracers of known numbers too, so this check uses NumPy.
+    if not (np.any(np.asarray(own.spring)) or np.any(np.asarray(own.exponents) == 0)):
+        raise InputError(
+            "springpots.spring = 0 leaves no shear stiffness at rest, so the body has no state of rest under gravity "
+            f"or tension: give spring above 0, {otherwise}"
+        )
+
+
 def series_at_rest(own: SpringpotSeries) -> Prony:
     """Return a Prony series whose completely relaxed stress is equal to the stress of the springpots at rest."""
     return Prony(ratios=1 - jnp.atleast_1d(factor_at_rest(own)), relaxation_times=jnp.ones(1), part=own.part)

@@ -132,6 +132,7 @@ def mesh_error_of(
     """Estimate the mesh error of a run that began at the reference positions.
 
     The node numbers of the scene must be known (not inside jit), and the arrays must contain all steps of the run.
+    Call `refuse` before `prepared`: a prepared scene no longer shows that its mesh was loaded.
 
     Args:
         scene: the scene that was run (`liverjax.simulation.run.prepared`).
@@ -142,8 +143,7 @@ def mesh_error_of(
             The estimate then also contains the error due to these numbers.
 
     Raises:
-        InputError: the scene has another mesh than the run, has a loaded mesh, or uses the one-step scheme, which has
-            an additional error.
+        InputError: the scene has another mesh than the run, or uses the one-step scheme, which has an additional error.
     """
     if positions.shape[1] != scene.mesh.number_of_nodes:
         raise InputError(

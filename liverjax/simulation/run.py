@@ -140,7 +140,8 @@ def simulate(
             mode is off; a wrong shape of `start`; `mesh_error` together with a loaded mesh, `start` or the one-step
             scheme. Inside jit, grad or vmap, numbers are not checked. If no reference shape is found there, the points
             are NaN and the status of the steps is NOT_FINITE. `check_scene`, which is called when a scene file is read,
-            checks more: the mesh, the positions of obstacles, and whether the supports prevent rigid motions.
+            checks more: the mesh, the shear modulus, the positions of obstacles, and whether the supports prevent rigid
+            motions.
     """
     if mesh_error:
         refuse(scene)

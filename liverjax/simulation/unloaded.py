@@ -27,7 +27,7 @@ from liverjax.physics.prescribed import Fixed
 from liverjax.physics.viscosity import lasting
 from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene import Scene, named_physics
-from liverjax.scenes.springpots import series_at_rest
+from liverjax.scenes.springpots import check_spring_at_rest, series_at_rest
 from liverjax.simulation import automatic, tangent
 from liverjax.simulation.equations import Equations, Sizes, equations, force_sizes, initial_state, residual, unknowns
 from liverjax.solvers.block_matrix import columns, flat
@@ -54,10 +54,12 @@ def unload(scene: Scene) -> Unloaded:
     `liverjax.simulation.run.unloaded` does the same, but also checks and prepares the scene.
 
     Raises:
-        InputError: no reference shape was found. Inside jit, grad or vmap no error is raised.
+        InputError: no reference shape was found, for example because springpots without a spring leave no shear
+            stiffness at rest. Inside jit, grad or vmap no error is raised.
     """
     points, code, relative, rounded = _found_shape(resting(scene))
     if not isinstance(code, jax.core.Tracer) and int(code) != status.CONVERGED:
+        check_spring_at_rest(scene.springpots, "or remove the gravity")
         if int(code) == status.STALLED and float(relative) <= float(rounded):
             precise = 'precision = "float64" or ' if points.dtype == jnp.float32 else ""
             raise InputError(

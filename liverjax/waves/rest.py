@@ -14,6 +14,7 @@ from liverjax.physics.porosity import Porosity
 from liverjax.physics.prescribed import free_degrees
 from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene import Scene, Solve
+from liverjax.scenes.springpots import check_spring_at_rest
 from liverjax.simulation.equations import forces_at
 from liverjax.simulation.run import prepared, simulate
 from liverjax.simulation.unloaded import resting
@@ -42,7 +43,7 @@ def under_its_weight(scene: Scene) -> jax.Array | None:
     still = resting(replace(by_element(scene), traction=(), **changed))
     if not (_is_heavy(scene) or _is_pulled(still)):
         return None
-    _check_spring(scene)
+    check_spring_at_rest(scene.springpots, "remove the gravity, or give a state of rest as the argument 'about'")
     # In a porous body the time step is so long that the flow ends within one step.
     dt = None if scene.porosity is None else _FOR_LONG
     solve = replace(still.solve, dt=dt, steps=4, frequencies=None)
@@ -57,19 +58,6 @@ def under_its_weight(scene: Scene) -> jax.Array | None:
             f"no state of rest under gravity or tension was found ({error}): fix the body, or give a state "
             "of rest as the argument 'about'"
         ) from None
-
-
-def _check_spring(scene: Scene) -> None:
-    """Raise InputError if spring and springpots leave no shear stiffness at rest."""
-    own = scene.springpots
-    if own is None or any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((own.spring, own.exponents))):
-        return
-    # Inside jit, jnp makes tracers of known numbers too, so this check uses NumPy.
-    if not (np.any(np.asarray(own.spring)) or np.any(np.asarray(own.exponents) == 0)):
-        raise InputError(
-            "springpots.spring = 0 leaves no shear stiffness at rest, so the body has no state of rest under gravity "
-            "or tension: give spring above 0, remove the gravity, or give a state of rest as the argument 'about'"
-        )
 
 
 def without_history(physics: Physics) -> Physics:

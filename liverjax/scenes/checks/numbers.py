@@ -3,6 +3,9 @@
 The mesh is not checked.
 """
 
+from collections.abc import Collection
+from contextlib import suppress
+
 import jax
 import numpy as np
 
@@ -12,7 +15,7 @@ from liverjax.mesh.shape_functions import basis
 from liverjax.physics import porosity, viscosity
 from liverjax.scenes.by_element import law_of_elements
 from liverjax.scenes.checks.regions import check_region_elements, check_region_numbers
-from liverjax.scenes.regions import POROUS, laws_of
+from liverjax.scenes.regions import POROUS, Region, laws_of
 from liverjax.scenes.scene import Scene, named_physics
 from liverjax.scenes.springpots import check_springpots
 
@@ -45,10 +48,16 @@ def check_bounds(scene: Scene) -> None:
     check_region_numbers(scene)
 
 
-def check_numbers(scene: Scene) -> None:
+def check_numbers(scene: Scene, changed: Collection[str] | None = None) -> None:
     """Check that all numbers can be used, also in combination. The mesh is not checked.
 
     Do not call this function inside jit.
+
+    Args:
+        scene: `Scene`.
+        changed: dotted names of the numbers that differ from those of a checked scene, for example ``law.mu``. The
+            elements of regions are then not checked again, and the shear modulus only if a law may have changed. If
+            None, everything is checked.
 
     Raises:
         InputError: a number is out of bounds, numbers of law, viscosity or porosity contradict each other, the shear
@@ -63,26 +72,37 @@ def check_numbers(scene: Scene) -> None:
             check_springpots(scene.springpots, law, scene.viscosity)
     if scene.porosity is not None:
         porosity.check_porosity(scene.porosity)
-    check_region_elements(scene)
-    _check_stiffness(scene)
+    if changed is None:
+        check_region_elements(scene)
+    if changed is None or any(name.split(".")[0] in ("law", "region") for name in changed):
+        _check_stiffness(scene)
 
 
 def _check_stiffness(scene: Scene) -> None:
     """Raise InputError if the shear modulus at rest of the whole law is negative in an element.
 
     One law of a sum may have a negative shear modulus. A law without the method `shear_modulus` is not checked, and
-    neither is a law inside jit, grad or vmap.
+    neither is a law inside jit, grad or vmap. The message names a region if the modulus is not negative without it.
     """
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((scene.law, scene.region))):
         return
-    whole = law_of_elements(scene.law, scene.region, scene.mesh.number_of_elements)
+    regions = scene.region
+    least = _least_shear_modulus(scene, regions)
+    if least < 0:
+        without = (_least_shear_modulus(scene, (*regions[:k], *regions[k + 1 :])) for k in range(len(regions)))
+        causes = [k for k, other in enumerate(without) if other >= 0]
+        name, more = (f"region.{causes[0]}: law", "") if len(causes) == 1 else ("law", " or those of its regions")
+        raise InputError(
+            f"{name} has a shear modulus of {least:.4g} Pa at rest, which must not be negative: change its "
+            f"parameters{more}, e.g. the sign of a coefficient"
+        )
+
+
+def _least_shear_modulus(scene: Scene, regions: tuple[Region, ...]) -> float:
+    """Return the smallest shear modulus at rest [Pa] of the body with these regions. Return infinity if no law has the
+    method `shear_modulus`."""
+    whole, least = law_of_elements(scene.law, regions, scene.mesh.number_of_elements), np.inf
     for k in range(len(whole.pieces())):
-        try:
-            moduli = np.asarray(whole.piece(k).shear_modulus(), float)
-        except InputError:  # a law may have no moduli
-            continue
-        if np.any(moduli < 0):
-            raise InputError(
-                f"law has a shear modulus of {moduli.min():.4g} Pa at rest, which must not be negative: change its "
-                "parameters or those of its regions, e.g. the sign of a coefficient"
-            )
+        with suppress(InputError):  # a law may have no moduli
+            least = np.min(np.asarray(whole.piece(k).shear_modulus(), float), initial=least)
+    return float(least)
