@@ -191,7 +191,7 @@ def test_bounds_and_points_on_a_face_are_found_in_single_precision():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert len(select_elements(rounded, {"z_min": 0.06}, None)) == 900
-    fine = lj.shapes.box((0.3, 0.3, 0.3), (100, 1, 1))  # a bound just beside a layer of nodes selected this layer
+    fine = lj.shapes.box((0.31, 0.3, 0.3), (100, 1, 1))  # a bound just beside a layer of nodes selected this layer
     assert len(lj.boundary.select(fine, {"x_min": 1e-6})) == 400
     single = [np.float32(units * np.asarray(fine.points)).astype(float) / units for units in (1.0, 1e3)]
     for mesh, number in ((fine, 400), *((lj.tet_mesh(points, fine.tetrahedra), 404) for points in single)):

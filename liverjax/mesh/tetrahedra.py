@@ -322,7 +322,9 @@ def tolerance_of_bounds(mesh: TetMesh) -> float:
 
     # Decimal numbers of few digits may also be exact in single precision. They have no roundoff.
     short = are(np.round(points, 9))
-    single = not short and any(are(np.float64(np.float32(units * points)) / units) for units in (1.0, 1e2, 1e3))
+    single = not short and any(
+        are((units * points).astype(np.float32).astype(float) / units) for units in (1.0, 1e2, 1e3)
+    )
     return roundoff_of(mesh, SINGLE_PRECISION if single else 0.0)
 
 
