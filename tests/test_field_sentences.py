@@ -74,7 +74,7 @@ def test_nodes_without_a_map_do_not_count():
     content = field_report.of_field(mesh, found)
     assert content["largest_mesh_bias_of_ln"] == content["largest_time_step_bias_of_ln"] == 0.1
     (said,) = content["warnings"]
-    assert said.startswith("the data do not determine the level of the map: at every node")
+    assert said.startswith("the data do not determine the level of the map: at every mapped node")
 
 
 def test_a_uniform_map_gives_no_sphere(capsys):

@@ -160,9 +160,10 @@ def test_the_error_of_a_noisy_test_is_its_noise():
     assert "in the band have decayed into the noise" in prediction.sentence(tail)
 
 
-def test_cycles_and_later_steps_are_in_the_band_of_the_sweep():
+def test_later_times_of_cycles_are_in_the_band_of_the_sweep_but_not_those_of_steps():
     """Times were counted from the first load. So the values of a cyclic test after 20 s did not count, although the
-    sweep contained its frequency, and their stress was 1.3 times too large without a sign of it."""
+    sweep contained its frequency, and their stress was 1.3 times too large without a sign of it. Then times were
+    counted from the last change. So values after a load of 50 s did count, although the sweep resolved only 20 s."""
     time, fit, s = np.arange(0, 60, 0.04), viscoelastic.closed_form(sweep(0.0, 0), 2), sweep(0.0, 0)
     strain = 1 - np.cos(2 * np.pi * time)
     stress = np.asarray(time_response.stress_response(TRUTH, time, strain)) * np.where(time > 25, 1.3, 1.0)
@@ -171,9 +172,17 @@ def test_cycles_and_later_steps_are_in_the_band_of_the_sweep():
     assert found.inside.all() and found.factor > 1.03 and "not counted" not in prediction.sentence(found)
     time = np.concatenate([[0.0], np.arange(1, 51), 50 + np.geomspace(0.005, 5, 20)])
     twice = TimeTest("relaxation", time, 1.0 * (time > 0) + (time > 50), 1 + time, time > 0)
-    place = np.concatenate([np.arange(1, 51), np.geomspace(0.005, 5, 20)])
-    inside = prediction.predict(fit, s.resolved, twice).inside
-    assert np.array_equal(inside, (place >= 0.01) & (place <= 20))
+    assert np.array_equal(prediction.predict(fit, s.resolved, twice).inside, time[1:] <= 20)
+    # A second load after 10 s: its first value comes too soon after the change.
+    soon = twice._replace(time=np.where(time > 50, time - 40, time / 5))
+    place = np.append(soon.time[1:51], soon.time[51:] - 10)
+    assert np.array_equal(prediction.predict(fit, s.resolved, soon).inside, place >= 0.01)
+    # A load of 25 s after cycles.
+    time = np.arange(0, 70, 0.25)
+    cycle = 1 - np.cos(2 * np.pi * time)
+    held = TimeTest("relaxation", time, np.where(abs(time - 42.5) < 12.5, 2.0, cycle), cycle + 1, time > 0)
+    inside = prediction.predict(fit, s.resolved, held).inside
+    assert inside[time[1:] < 49].all() and not inside[time[1:] > 50.1].any()
 
 
 def test_decayed_values_are_not_in_the_percentage():

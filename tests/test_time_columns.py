@@ -233,6 +233,24 @@ def test_numbers_to_the_right_of_the_last_heading_are_refused(read, header, row,
         read(tmp_path / "t.csv")
 
 
+def test_cells_to_the_right_are_refused_only_if_the_columns_may_be_wrong(tmp_path):
+    """A remark that began with a digit was refused as if decimal commas were the cause."""
+    rows, file = [f"{k};{900 - k}" for k in range(1, 9)], tmp_path / "t.csv"
+
+    def modulus(head: str, *ends: str) -> list[float]:
+        file.write_text("\n".join([head, *(row + end for row, end in zip(rows, [*ends, *[""] * 8], strict=False))]))
+        return read_columns(file)[0]["modulus"].tolist()
+
+    remarks = ";2nd sample, 20 C", ";12:30:05", ";;room;37", ";", ";dropped;5"
+    assert modulus("time_s;modulus_Pa", *remarks) == modulus("time_s;modulus_Pa;;", ";1;0") == list(range(899, 891, -1))
+    with pytest.raises(InputError, match="line 2: there are 3 cells under 2 headings; remove the cells to the right"):
+        modulus("time_s;modulus_Pa", ";0")
+    file.write_text("frequency (Hz);G' (Pa);G'' (Pa);;\n" + "".join(f"{k};{900 + k};{k};1;0\n" for k in range(1, 9)))
+    assert len(read_sweep(file).angular_frequency) == 8
+    file.write_text("time_s,modulus_Pa\n" + "".join(f"{k},{9 - k},2nd sample,20 C\n" for k in range(1, 9)))
+    assert len(read_columns(file)[0]["modulus"]) == 8
+
+
 def test_remarks_and_empty_cells_may_follow_the_numbers(tmp_path):
     (tmp_path / "t.csv").write_text("time_s,modulus_Pa\n# 1,2,3\n1,900,,\n2,800,dropped,\n3,700\n4,600,\n")
     assert read_columns(tmp_path / "t.csv")[0]["modulus"].tolist() == [900, 800, 700, 600]

@@ -1,5 +1,7 @@
 """Regions of measured waves: edges within the elements, against layers and cylinders in closed form."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -385,3 +387,18 @@ def test_regions_smaller_than_their_error_says_are_told(radius, told):
     slab[:, :, 6:8] = True  # two slices of an organ: its surface does not make a region small
     said = cautions._of_small_regions(field._replace(mask=slab), np.array([1, 2]))
     assert not any("1 (" in one for one in said)
+
+
+@pytest.mark.parametrize("second", [True, False])
+def test_a_second_search_replaces_the_first_only_if_it_converges(monkeypatch, second):
+    """The second search replaced the first one also if both failed."""
+    ends = iter([(1.0, True), (2.0, False), (3.0, second)])
+
+    def search(m, waves, f, G, progress):
+        value, converged = next(ends)
+        return np.full(1, value + 0j), np.eye(2), np.zeros(1), value, 1, converged, None
+
+    monkeypatch.setattr(regions, "_one_frequency", search)
+    waves = regions.MeasuredWaves(np.array([1.0, 2.0]), np.zeros((2, 3), complex), np.ones(2))
+    found = regions.moduli_of_regions(SimpleNamespace(balances=1), waves, np.ones(1))
+    assert found.chi2.tolist() == [1.0, 3.0 if second else 2.0] and found.converged.tolist() == [True, second]

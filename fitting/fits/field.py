@@ -427,9 +427,9 @@ def distance_sentence(found: Field) -> str | None:
     )
 
 
-#: If the standard deviation of ln(modulus) exceeds this value at every node, the data do not determine the level of the
-#: map. The same holds if the standard deviation of the level from the data alone exceeds this value. The second test is
-#: needed because the prior limits the standard deviation at the nodes.
+#: If the standard deviation of ln(modulus) exceeds this value at every mapped node, the data do not determine the level
+#: of the map. The same holds if the standard deviation of the level from the data alone exceeds this value. The second
+#: test is needed because the prior limits the standard deviation at the nodes.
 OPEN = 0.5
 
 
@@ -437,7 +437,7 @@ def level_sentence(found: Field) -> str | None:
     """Return a warning if the data do not determine the level of the map (`OPEN`), otherwise None."""
     least = float(np.min(found.sd))
     if least > OPEN:
-        size = f"at every node, the modulus is uncertain by a factor of {np.exp(least):.2g} or more"
+        size = f"at every mapped node, the modulus is uncertain by a factor of {np.exp(least):.2g} or more"
     elif found.level_sd > OPEN:
         size = "only the prior ties the mean modulus to the value in the scene, and the standard deviations assume this"
     else:

@@ -1,6 +1,8 @@
 """Find the times at which the load of a relaxation or creep test begins to change or changes its direction, and find
 which of two columns is the load."""
 
+from functools import lru_cache
+
 import numpy as np
 
 from fitting.readers.noise_of_series import noise_of_series
@@ -47,7 +49,14 @@ def first_is_imposed(time: np.ndarray, first: np.ndarray, second: np.ndarray) ->
 def begins_of_changes(time: np.ndarray, driven: np.ndarray, begun: float) -> np.ndarray:
     """Return the times (k,) [s] at which the load begins to change, or changes its direction. The first time is
     `begun`. Changes below _LEAST_CHANGE times the largest load do not count. If the load scatters, the limit is
-    larger."""
+    larger. The result for the last few tests is kept, because a fit needs it many times."""
+    return _begins_of_kept(np.asarray(time, float).tobytes(), np.asarray(driven, float).tobytes(), begun)
+
+
+@lru_cache(maxsize=8)
+def _begins_of_kept(times: bytes, loads: bytes, begun: float) -> np.ndarray:
+    """Return the same as `begins_of_changes`, as an array that cannot be changed."""
+    time, driven = np.frombuffer(times), np.frombuffer(loads)
     size = float(np.max(np.abs(driven)))
     allowed = float(np.clip(_OF_SCATTER * noise_of_series(driven), _CLOSE * size, _LOOSE * size))
     corners = _corners_of_load(time, driven, allowed)
@@ -58,7 +67,9 @@ def begins_of_changes(time: np.ndarray, driven: np.ndarray, begun: float) -> np.
     begin |= np.diff(np.sign(moves), prepend=0.0) != 0
     begin[:1] &= np.abs(load[large[:1]]) > 2 * least  # the first change from rest begins at `begun`
     begins = at[large[begin]]
-    return np.append(begun, begins[begins > begun])
+    found = np.append(begun, begins[begins > begun])
+    found.setflags(write=False)
+    return found
 
 
 def _corners_of_load(time: np.ndarray, driven: np.ndarray, allowed: float) -> np.ndarray:

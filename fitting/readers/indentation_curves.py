@@ -263,7 +263,7 @@ def _in_si_units(
     sign, kept, empty = decimal_sign(cell for _, cells in rows for cell in cells), [], 0
     headings = split_cells(lines[head], delimiter)
     for number, cells in rows:
-        refuse_unnamed_numbers(path, number, cells, headings)
+        refuse_unnamed_numbers(path, number, cells, headings, delimiter)
         shown = [cells[p.column] if p.column < len(cells) else "" for p in found.values()]
         values = [to_number(cell, delimiter, sign) for cell in shown]
         wrong = [cell for cell, value in zip(shown, values, strict=True) if value is None or np.isinf(value)]

@@ -112,7 +112,7 @@ class TimeTest(NamedTuple):
     def answers_at_once(self) -> bool:
         """Whether a response at the instant of a step is fitted. Such a response determines G0, but no relaxation
         time."""
-        return bool(_at_once(self.since_change[self.used]).any())
+        return bool(_at_once(self.time[self.used], self.since_change[self.used]).any())
 
     @property
     def since_change(self) -> np.ndarray:
@@ -125,8 +125,8 @@ class TimeTest(NamedTuple):
     def resolved(self) -> tuple[float, float]:
         """Shortest and longest relaxation time [s] that the test resolves: the shortest time of a fitted response since
         a change of the load (`since_change`), and the time from the start of the load to the last fitted response."""
-        since = self.since_change[self.used]
-        return float(since[~_at_once(since)].min()), float(self.time[self.used][-1] - self.begun)
+        time, since = self.time[self.used], self.since_change[self.used]
+        return float(since[~_at_once(time, since)].min()), float(time[-1] - self.begun)
 
 
 class Sample(NamedTuple):
@@ -317,11 +317,12 @@ def _rows_of_jumps(time: np.ndarray, driven: np.ndarray) -> np.ndarray:
     return 1 + np.flatnonzero((own > least) & alone)
 
 
-def _at_once(since: np.ndarray) -> np.ndarray:
-    """Return whether each response (n,) is at the instant of a step. `since`: times (n,) [s] since the last change of
-    the load."""
+def _at_once(time: np.ndarray, since: np.ndarray) -> np.ndarray:
+    """Return whether each response (n,) is at the instant of a step. `time`: times (n,) [s] of the responses. `since`:
+    times (n,) [s] since the last change of the load."""
     first = np.diff(since, prepend=np.inf) <= 0  # the first response after a change
-    return first & (since < AT_ONCE * np.append(since[1:], 0.0))
+    # No response follows the last one, so the two intervals before it count. One of them may be a step.
+    return first & (since < AT_ONCE * np.append(since[1:], np.ptp(time[-3:])))
 
 
 def rows_before_jumps(rows: np.ndarray, ramp: float, time: np.ndarray, *columns: np.ndarray) -> tuple:

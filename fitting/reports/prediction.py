@@ -30,7 +30,7 @@ class Prediction(NamedTuple):
     standard_errors: np.ndarray  # (m,) of the predicted values; infinite if the fit does not determine a value
     scales: np.ndarray  # (m,) residuals are weighted by 1 / scales: standard deviations if the test has them
     sizes: np.ndarray  # (m,) relative error = |predicted - measured| / sizes; infinite if a value does not count
-    inside: np.ndarray  # (m,) whether the point is in the band of the fitted sweep
+    inside: np.ndarray  # (m,) whether the point is in the band of the fitted sweep, see `_in_band`
     noise: np.ndarray  # (m,) noise of the measured values, divided by `scales`; NaN: too few values to estimate it
     quantile: float  # half width of the 95 % interval of the fit, divided by its standard error
 
@@ -81,13 +81,7 @@ def predict(fit: Fit, resolved: tuple[float, float], test: Measured) -> Predicti
     slopes = np.asarray(jax.jacfwd(answers)(jnp.asarray(vector)))
     with np.errstate(over="ignore", invalid="ignore"):
         errors = np.linalg.norm(slopes @ fit.uncertainty.root, axis=1)
-    low, high = resolved
-    if isinstance(test, TimeTest):
-        place = test.since_change[time_tests.thinned(test)]
-    else:
-        omega = np.asarray(at[0])
-        place = np.tile(1 / omega, len(measured) // len(omega))
-    inside = (place >= low * (1 - 1e-9)) & (place <= high * (1 + 1e-9))
+    inside = _in_band(test, resolved, len(measured))
     errors = np.where(errors < 1e30, errors, np.inf)
     predicted = np.asarray(answers(jnp.asarray(vector)))
     sizes = sizes_of(test)
@@ -97,6 +91,24 @@ def predict(fit: Fit, resolved: tuple[float, float], test: Measured) -> Predicti
     noise = _scatter_around(off.reshape(parts, -1), inside.reshape(parts, -1), test).ravel()
     own = (errors, scales, sizes, inside, noise, fit.uncertainty.quantile)
     return Prediction(name_of(test), test.source, predicted, measured, *own)
+
+
+def _in_band(test: Measured, resolved: tuple[float, float], count: int) -> np.ndarray:
+    """Return whether each of the `count` values (m,) of a test depends only on resolved relaxation times.
+
+    In a relaxation or creep test, the load must have changed last at least the shortest of these times ago, and must
+    have begun at most the longest of these times ago. In a cyclic test, the load may have begun earlier, if it never
+    went on for more than the longest of these times without a change (`TimeTest.since_change`)."""
+    low, high = resolved[0] * (1 - 1e-9), resolved[1] * (1 + 1e-9)
+    if not isinstance(test, TimeTest):
+        omega = np.asarray(reported_numbers(test)[0][0])
+        place = np.tile(1 / omega, count // len(omega))
+        return (place >= low) & (place <= high)
+    since = test.since_change
+    inside = test.time - test.begun <= high
+    if test.cyclic:
+        inside |= np.maximum.accumulate(since) <= high
+    return ((since >= low) & inside)[time_tests.thinned(test)]
 
 
 def _scatter_around(off: np.ndarray, inside: np.ndarray, test: Measured) -> np.ndarray:

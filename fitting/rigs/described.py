@@ -66,6 +66,8 @@ _WIDE, _WIDEST = 0.05, 500
 #: A punch that goes back has lost the contact if its force is below AT_REST times the largest force, or below
 #: _NO_FORCE standard deviations of the noise of the force.
 _NO_FORCE = 3.0
+#: Its depth, relative to the largest one, must also exceed _DEEP times the relative limit of the force, or _DEEPEST.
+_DEEP, _DEEPEST = 5.0, 0.5
 #: Rows in which the force exceeds this fraction of the largest force show the direction of an indentation.
 _PRESSED = 0.5
 #: Minimum number of rows in which the contact grows, including the row at rest.
@@ -158,9 +160,16 @@ def read_described(path: str | Path) -> TimeTest:
 
 def _sign_of_load(described: Described, d: np.ndarray, force: np.ndarray) -> float:
     """Return the sign (1 or -1) of the displacement d (n,) that loads the sample. Before the contact, an indenter may
-    move further than it moves in the sample. So only the rows with a large force count for an indenter."""
-    size = np.abs(force)
-    pressed = float(np.median(d[size >= _PRESSED * size.max()])) if "thickness" in described.sizes else 0.0
+    move further than it moves in the sample. So only the rows with a large force count for an indenter. If these are
+    all rows, or rows without a displacement, the force before the first movement is taken as an offset."""
+    pressed = 0.0
+    if "thickness" in described.sizes:
+        still = int(np.argmax(np.abs(d - d[0]) > AT_REST * np.ptp(d)))
+        for offset in (0.0, np.median(force[: max(still, 1)])):
+            large = np.abs(force - offset) >= _PRESSED * np.max(np.abs(force - offset))
+            pressed = float(np.median(d[large]))
+            if not large.all() and abs(pressed) > AT_REST * np.max(np.abs(d)):
+                break
     return float(np.sign(pressed or d[np.argmax(np.abs(d))])) or 1.0
 
 
@@ -226,11 +235,16 @@ def _while_contact_grows(time: np.ndarray, depth: np.ndarray) -> tuple[int, list
 
 def _while_punch_presses(time: np.ndarray, depth: np.ndarray, force: np.ndarray) -> tuple[int, list[str]]:
     """Return the number of rows before a punch loses the contact, and a note if it loses the contact: it goes back, and
-    its force falls to 0. While a punch presses on the sample, its contact does not shrink, so it may go back."""
+    its force falls to 0 before the depth falls to 0. While a punch presses on the sample, its contact does not shrink,
+    so it may go back."""
     loaded = int(np.argmax(depth > AT_REST * depth.max()))
     smooth = scipy.ndimage.median_filter(force, _ROWS, mode="nearest")  # removes single low values
     smooth -= np.median(force[:loaded]) if loaded >= _ROWS else 0.0  # the sensor may have an offset
-    free = _gone_back(depth) & (smooth <= max(AT_REST * smooth.max(), _NO_FORCE * noise_of_series(force)))
+    least = max(AT_REST * smooth.max(), _NO_FORCE * noise_of_series(force))
+    free = _gone_back(depth) & (smooth <= least)
+    # In a cycle, force and depth may fall to 0 together. A punch that is lifted between two rows was deep before.
+    deep = min(_DEEP * least / max(smooth.max(), 1e-300), _DEEPEST) * depth.max()
+    free &= np.maximum(depth, np.append(depth[:1], depth[:-1])) > deep
     if not free.any():
         return len(time), []
     kept = int(np.argmax(free))
@@ -406,7 +420,8 @@ def _glued_curve(
         try:
             other, reverse, told = secants(described, -back, path)
         except InputError as error:  # `np.interp` below then returns the first secant there
-            other, reverse, told = at[:0], secant[:0], [f"the force is assumed to be linear there, because {error}"]
+            cause = str(error).removeprefix(f"{path}: ").partition(";")[0]  # without the remedy
+            other, reverse, told = at[:0], secant[:0], [f"the force is assumed to be linear there, because {cause}"]
         at, secant = np.concatenate([other[::-1], at]), np.concatenate([reverse[::-1], secant])
         notes += [f"for displacements against the direction of the load: {note}" for note in told if note not in notes]
     return (lambda d: d * float(np.interp(d, at, secant))), height, notes

@@ -217,7 +217,7 @@ def _columns(path: str, lines: list[str], header: tuple) -> dict[str, np.ndarray
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         cells = split_cells(line, delimiter)
-        refuse_unnamed_numbers(path, number, cells, headings)
+        refuse_unnamed_numbers(path, number, cells, headings, delimiter)
         values = [to_number(cells[p], delimiter) if p < len(cells) else None for p, _ in found.values()]
         if not all(v is not None and np.isfinite(v) for v in values):
             raise InputError(

@@ -128,7 +128,8 @@ def moduli_of_regions(
         waves: the measured waves.
         start: starting point of the search: the complex modulus of each region [Pa], (R,), or (F, R) with own moduli
             for each frequency. If the search converged at a lower frequency, it starts from the moduli that were found
-            there (at the nearest such frequency). If it does not converge from there, it starts again from `start`.
+            there (at the nearest such frequency). If it does not converge from there, it starts again from `start`. The
+            result of the second search is used only if it converges.
         progress: function that is called after every iteration, with its number and chi^2 per equation.
         voxel: voxel index of each node (V, 3), needed to estimate the correlation of the noise. If it is None, the
             noise is assumed to be white.
@@ -137,7 +138,8 @@ def moduli_of_regions(
     for f, own in enumerate(np.broadcast_to(start, (len(waves.omega), np.shape(start)[-1])).astype(complex)):
         *one, now = _one_frequency(m, waves, f, own if before is None else before, progress)
         if before is not None and not one[-1]:
-            *one, now = _one_frequency(m, waves, f, own, progress)
+            *again, then = _one_frequency(m, waves, f, own, progress)
+            one, now = (again, then) if again[-1] else (one, now)
         found.append(one)
         before = one[0] if one[-1] else before
         if voxel is not None:

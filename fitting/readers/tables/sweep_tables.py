@@ -285,7 +285,7 @@ def _rows_below(path, columns, lines, k, delimiter, headings):
                 notes.append(f"line {k + 1}, {_line_shown(line)}, has no numbers, and the rows below it are not read")
             break  # the header was only a title, or this table ends
         k += 1
-        refuse_unnamed_numbers(path, k, cells, headings)
+        refuse_unnamed_numbers(path, k, cells, headings, delimiter)
         every.append(cells)
         numbers.append(k)
     summaries = summary_rows(every)

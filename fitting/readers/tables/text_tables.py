@@ -138,20 +138,25 @@ def split_cells(line: str, delimiter: str) -> list[str]:
     return [c.strip() for c in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])]
 
 
-def refuse_unnamed_numbers(path: str | os.PathLike, number: int, cells: list[str], headings: list[str]) -> None:
-    """Raise `InputError` if line `number` has a number in a cell to the right of the last heading.
+def refuse_unnamed_numbers(
+    path: str | os.PathLike, number: int, cells: list[str], headings: list[str], delimiter: str
+) -> None:
+    """Raise `InputError` if numbers to the right of the headings show that line `number` may be read wrongly. Remarks
+    and empty cells may follow the numbers.
 
-    Decimal commas in a table with commas between its cells give such lines. Remarks and empty cells may follow the
-    numbers.
+    Decimal commas in a table with commas between its cells give such numbers. With other delimiters, only a number next
+    to the last column is refused, because the headings may then stand above the wrong columns.
     """
     width = len(headings)
-    while width and not headings[width - 1].strip('" '):
+    while delimiter == "," and width and not headings[width - 1].strip('" '):
         width -= 1
-    if any(re.match(r"[-+]?[.,]?\d", cell) for cell in cells[width:]):
-        raise InputError(
-            f"{path}: line {number}: there are {len(cells)} cells under {width} headings; write decimals with a point, "
-            "and give every column a heading"
-        )
+    beyond = cells[width:] if delimiter == "," else cells[width : width + 1]
+    values = [to_number(cell, delimiter) for cell in beyond]
+    if any(value is not None and math.isfinite(value) for value in values):
+        remedy = "write decimals with a point, and give every column a heading"
+        if delimiter != ",":
+            remedy = "remove the cells to the right, or give them headings"
+        raise InputError(f"{path}: line {number}: there are {len(cells)} cells under {width} headings; {remedy}")
 
 
 #: Strings in cells without a measurement.

@@ -338,7 +338,7 @@ def _rows_in_time(path, lines, k, delimiter, found):
         _, cells = split_line(line, delimiter)
         own = [cells[p] if p < len(cells) else "" for p in needed.values()]
         if not means_nothing(own) and not line.lstrip().startswith("#"):
-            refuse_unnamed_numbers(path, k, cells, headings)
+            refuse_unnamed_numbers(path, k, cells, headings, delimiter)
             kept.append(own)
             every.append(cells)
             numbers.append(k)

@@ -242,7 +242,7 @@ def _voxel_table(path: Path) -> Content:
         )
     rows = np.full((len(lines) - 1, len(head)), np.nan)
     for k, (number, line) in enumerate(lines[1:]):
-        refuse_unnamed_numbers(path, number, written := split_cells(line, between), head)
+        refuse_unnamed_numbers(path, number, written := split_cells(line, between), head, between)
         cells = [_quick_number(cell, between) for cell in written[: len(head)]]
         if None in cells:
             raise InputError(f"{path}: row {number}: {line[:40]!r} has a cell that is not a number; correct this row")
