@@ -50,6 +50,19 @@ def test_deviations_of_three_repeats_are_smoothed_in_short_sweeps_too(parts, poi
     assert all(np.allclose(a, b, rtol=0.01) for a, b in same)
 
 
+@pytest.mark.parametrize("steep", [0.4, 0.7])
+def test_smooth_deviations_of_short_sweeps_are_kept(steep):
+    """Deviations that grow with the measured frequency are no scatter, although they form a sawtooth over the shifted
+    frequency. They were replaced by a parabola over all frequencies, up to 13 times too large."""
+    sweeps = []
+    for factor in np.geomspace(0.03, 30, 7):
+        measured = np.geomspace(0.3, 30, 6)
+        s, part = exact(factor * measured), 0.01 * measured**steep
+        sweeps.append(s._replace(storage_sd=part * s.storage, loss_sd=part * s.loss))
+    whole = temperature_sweeps.joined(sweeps)
+    assert np.allclose(whole.deviations, (whole.storage_sd, whole.loss_sd))
+
+
 def test_a_temperature_without_usable_points_is_ignored():
     """One temperature outside of the band made the command refuse all."""
     hertz = [(10.0, 100.0), (0.1, 100.0), (0.1, 100.0)]

@@ -235,7 +235,8 @@ def deviations_of_sweeps(omega: np.ndarray, modulus: np.ndarray, sd: np.ndarray,
     """Return smooth standard deviations (n,) of joined sweeps. `numbers` (n,): number of the sweep of each point.
 
     Each sweep with `_POINTS` or more frequencies is smoothed separately. A shorter sweep has too few points for this,
-    so all shorter sweeps are smoothed together, after a division by the level of each sweep (`_levels_of_sweeps`).
+    so all shorter sweeps are smoothed together, after a division by the level of each sweep (`_levels_of_sweeps`). If
+    their deviations are smooth in each sweep already, they are not changed.
     """
     out, short = np.empty(len(omega)), np.zeros(len(omega), bool)
     for k in np.unique(numbers):
@@ -245,9 +246,29 @@ def deviations_of_sweeps(omega: np.ndarray, modulus: np.ndarray, sd: np.ndarray,
         else:
             out[own] = smooth_deviations(omega[own], modulus[own], sd[own])
     if short.any():
-        level = _levels_of_sweeps(np.log(sd / modulus)[short], numbers[short])
+        part = np.log(sd / modulus)[short]
+        if _smooth_in_sweeps(np.log(omega[short]), part, numbers[short]):
+            out[short] = sd[short]
+            return out
+        level = _levels_of_sweeps(part, numbers[short])
         out[short] = level * smooth_deviations(omega[short], modulus[short], sd[short] / level)
     return out
+
+
+def _smooth_in_sweeps(x: np.ndarray, part: np.ndarray, numbers: np.ndarray) -> bool:
+    """Return whether relative standard deviations follow the same parabola over the frequency in each sweep, apart from
+    the level of the sweep. If they are a fixed percentage in each sweep, the result is False, because this percentage
+    belongs to moduli with noise. `x`, `part`: logarithms (n,) of the frequency and of the relative deviations."""
+    place = np.unique(numbers, return_inverse=True)[1]
+    count = np.bincount(place)
+    u = x - (np.bincount(place, x) / count)[place]
+    levels = (place[:, None] == np.arange(len(count))).astype(float)
+    A = np.column_stack([levels, u, u**2])
+    off = part - A @ np.linalg.lstsq(A, part)[0]
+    freedom = len(part) - A.shape[1]
+    if freedom < 1 or np.ptp(part - (np.bincount(place, part) / count)[place]) < _ROUNDED:
+        return False
+    return float(np.sqrt(np.sum(off**2) / freedom)) < _FEW_REPEATS
 
 
 def _levels_of_sweeps(part: np.ndarray, numbers: np.ndarray) -> np.ndarray:
