@@ -11,6 +11,7 @@ import pytest
 import liverjax as lj
 from liverjax.core.struct import replace
 from liverjax.mesh.locate import elements_at
+from liverjax.mesh.promotion import quadratic
 from liverjax.scenes.by_element import law_of_elements
 from liverjax.scenes.regions import select_elements
 from liverjax.scenes.scene import numbers_at, with_parameters
@@ -196,6 +197,10 @@ def test_bounds_and_points_on_a_face_are_found_in_single_precision():
     single = [np.float32(units * np.asarray(fine.points)).astype(float) / units for units in (1.0, 1e3)]
     for mesh, number in ((fine, 400), *((lj.tet_mesh(points, fine.tetrahedra), 404) for points in single)):
         assert len(lj.boundary.select(mesh, {"x_min": 1e-8})) == number  # exact coordinates: within 1e-9 of the size
+    curved = lj.tet_mesh(np.asarray(rounded.points).astype(float), rounded.tetrahedra)
+    assert len(lj.boundary.select(quadratic(curved), {"z_min": 0.12})) == len(
+        lj.boundary.select(quadratic(exact), {"z_min": 0.12})
+    )
     elements_at(rounded, np.array([[0.1, 0.05, 0.12], [0.2, 0.1, 0.12]]), "points")
     with pytest.raises(lj.InputError, match="outside the body"):
         elements_at(rounded, np.array([[0.1, 0.05, 0.12001]]), "points")

@@ -312,10 +312,6 @@ IDLE = {
         {"solve": {"kind": "harmonic", "frequencies": [1.0]}, "body": {"density": 1.0, "mass": "lumped"}},
         r"\[body\] mass = 'lumped' cannot be used with \[solve\] kind = 'harmonic', which uses consistent masses",
     ),
-    "iterations of waves": (
-        {"solve": {"kind": "harmonic", "frequencies": [1.0], "newton_iterations": 1}, "body": {"density": 1.0}},
-        r"\[solve\] newton_iterations = 1 cannot be used with kind = 'harmonic'",
-    ),
     "forces of waves": (
         {"solve": {"kind": "harmonic", "frequencies": [1.0]}, "body": {"density": 1.0}, "output": {"reactions": True}},
         r"\[output\] reactions cannot be used with",

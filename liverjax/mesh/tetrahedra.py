@@ -313,18 +313,16 @@ def roundoff_of(mesh: TetMesh, relative: float = SIX_DIGITS) -> float:
 def tolerance_of_bounds(mesh: TetMesh) -> float:
     """Return the distance [m] from a bound at which a node still lies on the bound: 1e-9 of the mesh's size.
 
-    If the file gave the coordinates in single precision, in m, cm or mm, it is the roundoff of this precision.
+    If the file gave the coordinates in single precision, in one of the `UNITS`, it is the roundoff of this precision.
     """
-    points = np.asarray(mesh.points, float)
+    points = np.asarray(mesh.points, float)[: mesh.number_of_vertices]  # midside nodes may be computed
 
     def are(rounded: np.ndarray) -> bool:
         return bool(np.all(np.abs(rounded - points) <= 1e-15 * np.abs(points)))
 
     # Decimal numbers of few digits may also be exact in single precision. They have no roundoff.
     short = are(np.round(points, 9))
-    single = not short and any(
-        are((units * points).astype(np.float32).astype(float) / units) for units in (1.0, 1e2, 1e3)
-    )
+    single = not short and any(are((points / unit).astype(np.float32).astype(float) * unit) for unit in UNITS.values())
     return roundoff_of(mesh, SINGLE_PRECISION if single else 0.0)
 
 

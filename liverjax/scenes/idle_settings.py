@@ -47,11 +47,6 @@ def refuse_idle(content: Content) -> None:
                 f"[solve] {key} = {solve[key]!r} has no effect with kind = 'harmonic', and it does not change the "
                 "state of rest: remove this key"
             )
-    if motion == "harmonic" and solve.get("newton_iterations") == 1:
-        raise InputError(
-            "[solve] newton_iterations = 1 cannot be used with kind = 'harmonic', because the state of rest needs "
-            "several iterations: give more iterations, or remove this key"
-        )
     if motion == "harmonic" and content.get("body", {}).get("mass") == "lumped":
         raise InputError(
             "[body] mass = 'lumped' cannot be used with [solve] kind = 'harmonic', which uses consistent masses: "

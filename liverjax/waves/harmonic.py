@@ -311,7 +311,8 @@ def refuse_not_harmonic(scene: Scene) -> None:
     if scene.points_are == "loaded":
         raise InputError(
             '[mesh] is = "loaded" cannot be used in harmonic motion: in Python, use the scene of lj.unloaded(scene); '
-            "with the command, use vtu/step_00001.vtu of a static run with --vtu and the stiffness at rest as the mesh"
+            "with the command, first do a static run with --vtu and with the law at rest, then give its "
+            "vtu/step_00001.vtu as [mesh] file, without unit and is"
         )
     if any(isinstance(physics, RoughObstacle | PressedObstacle) for physics in scene.physics):
         raise InputError(

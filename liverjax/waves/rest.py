@@ -15,6 +15,7 @@ from liverjax.physics.prescribed import free_degrees
 from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene import Scene, Solve
 from liverjax.scenes.springpots import check_spring_at_rest
+from liverjax.simulation.automatic import is_one_step
 from liverjax.simulation.equations import forces_at
 from liverjax.simulation.run import prepared, simulate
 from liverjax.simulation.unloaded import resting
@@ -34,8 +35,8 @@ def under_its_weight(scene: Scene) -> jax.Array | None:
     NaN if no state of rest is found.
 
     Raises:
-        InputError: no state of rest was found (outside jit, grad and vmap), or springpots without a spring leave no
-            shear stiffness at rest.
+        InputError: no state of rest was found (outside jit, grad and vmap), springpots without a spring leave no
+            shear stiffness at rest, or `newton_iterations` is 1.
     """
     body = None if scene.body is None else replace(scene.body, times=None, history=None)
     changed: Content = {"body": body, "porosity": _without_inflow(scene.porosity)}
@@ -44,6 +45,11 @@ def under_its_weight(scene: Scene) -> jax.Array | None:
     if not (_is_heavy(scene) or _is_pulled(still)):
         return None
     check_spring_at_rest(scene.springpots, "remove the gravity, or give a state of rest as the argument 'about'")
+    if is_one_step(still.solve):
+        raise InputError(
+            "solve.newton_iterations = 1 cannot be used here, because the state of rest needs several iterations: give "
+            "more iterations, or remove this key"
+        )
     # In a porous body the time step is so long that the flow ends within one step.
     dt = None if scene.porosity is None else _FOR_LONG
     solve = replace(still.solve, dt=dt, steps=4, frequencies=None)

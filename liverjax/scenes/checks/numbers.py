@@ -104,5 +104,5 @@ def _least_shear_modulus(scene: Scene, regions: tuple[Region, ...]) -> float:
     whole, least = law_of_elements(scene.law, regions, scene.mesh.number_of_elements), np.inf
     for k in range(len(whole.pieces())):
         with suppress(InputError):  # a law may have no moduli
-            least = np.min(np.asarray(whole.piece(k).shear_modulus(), float), initial=least)
+            least = np.fmin.reduce(np.ravel(np.asarray(whole.piece(k).shear_modulus(), float)), initial=least)
     return float(least)

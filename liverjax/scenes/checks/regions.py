@@ -188,7 +188,7 @@ def _check_limits(scene: Scene) -> None:
     places = {k: scene.region[k].elements for k in changed}
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((values, changed, places))):
         return
-    if any(np.shape(value) not in ((), (n,)) for value in values.values()):
+    if any(np.shape(value) not in ((), (1,), (n,)) for value in values.values()):
         return  # a wrong number of values
     for key in keys:
         numbers = np.broadcast_to(np.asarray(values[key], float), (n,)).copy()
