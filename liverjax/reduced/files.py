@@ -10,6 +10,7 @@ import numpy as np
 
 from liverjax.core.errors import InputError
 from liverjax.core.files import whole
+from liverjax.core.struct import replace
 from liverjax.core.versions import versions
 from liverjax.reduced.correction import Correction
 from liverjax.reduced.model import PressureModes, ReducedModel
@@ -50,6 +51,10 @@ def save_reduced(model: ReducedModel, file: str | Path, scene_text: str = "") ->
                 out[f"pressures/{name}"].attrs["unit"] = unit
         for name, value in model.ranges.items():
             out[f"ranges/{name}"] = np.asarray(value)
+        if model.loads is not None:
+            loads = out.create_group("loads")  # may be empty
+            for name, value in model.loads.items():
+                loads[name] = np.asarray(value)
         out.attrs["identity"], out.attrs["others"], out.attrs["scene"] = model.identity, model.others, scene_text
         out.attrs["versions"] = json.dumps(versions())
 
@@ -70,11 +75,15 @@ def load_reduced(file: str | Path) -> ReducedModel:
             arrays["slopes"] = np.ascontiguousarray(np.moveaxis(arrays["slopes"], 0, -1))
             arrays = {name: jnp.asarray(array) for name, array in arrays.items()}
             ranges = {name: jnp.asarray(value[()]) for name, value in stored.get("ranges", {}).items()}
+            loads = {name: jnp.asarray(value[()]) for name, value in stored.get("loads", {}).items()}
             identity, others = str(stored.attrs["identity"]), str(stored.attrs.get("others", ""))
+            # Models of an earlier version of the program contain region.0.law.['mu'] in place of region.0.law.mu.
+            others = others.replace("['", "").replace("']", "")
             correction, fluid = _correction(stored), _pressures(stored)
-        model = ReducedModel(
-            **arrays, ranges=ranges, correction=correction, pressures=fluid, identity=identity, others=others
-        )
+            found = ReducedModel(
+                **arrays, ranges=ranges, correction=correction, pressures=fluid, identity=identity, others=others
+            )
+            model = replace(found, loads=loads if "loads" in stored else None)
         wrong = _wrong(model)
     except (OSError, KeyError, AttributeError, TypeError, ValueError, RuntimeError) as error:
         raise InputError(
@@ -104,6 +113,8 @@ def _wrong(model: ReducedModel) -> str:
         arrays |= {f"pressures.{name}": getattr(fluid, name) for name in of_fluid}
     for name, bounds in model.ranges.items():
         shapes[f"ranges of {name}"], arrays[f"ranges of {name}"] = (2, *jnp.shape(bounds)[1:]), bounds
+    for name, bounds in (model.loads or {}).items():
+        shapes[f"loads of {name}"], arrays[f"loads of {name}"] = (2, *jnp.shape(bounds)[1:]), bounds
     for name, array in arrays.items():
         if jnp.shape(array) != shapes[name]:
             return f"{name} has shape {jnp.shape(array)}, not {shapes[name]}"

@@ -45,8 +45,10 @@ BEYOND = 0.1
 #: Entries of a scene that contain numbers on which the motion depends.
 _PARTS = ("law", "region", "viscosity", "porosity", "body", "displaced", "traction", "physics")
 #: Names of numbers that may differ from the training runs, because a load with another history can lead to the same
-#: states.
+#: states. The size of the load is checked by its values during the run (`loads_of_run`).
 _FREE = ("times", "history")
+#: Entries of a scene that may have a history, and the name of the number that a history multiplies or replaces.
+_TIMED = {"body": "gravity", "displaced": "by", "traction": "value"}
 
 
 @struct
@@ -74,6 +76,9 @@ class ReducedModel:
     ranges: dict[str, Any] = param("1", "name of each training parameter -> its lowest and highest value")
     correction: Correction | None = param("1", "correction of the motion (`Correction`), or None", default=None)
     pressures: PressureModes | None = param("1", "pressure modes; None if the scene has no porous body", default=None)
+    loads: dict[str, Any] | None = param(
+        "1", "lowest and highest values in all training runs (`loads_of_run`); None in older models", default=None
+    )
     identity: str = static(default="", about="digest of the scene for which the model is made")
     others: str = static(default="", about="digests of the numbers that are equal in all training runs, as JSON")
 
@@ -242,8 +247,8 @@ def other_numbers(scene: Scene, varied: Mapping[str, np.ndarray | jax.Array]) ->
     scene = with_parameters(scene, {name: np.zeros_like(np.asarray(value, float)) for name, value in varied.items()})
     found = {}
     for part in _PARTS:
-        for path, leaf in jax.tree_util.tree_flatten_with_path(getattr(scene, part))[0]:
-            words = [str(getattr(key, "name", getattr(key, "idx", key))) for key in path]
+        for path, leaf in jax.tree_util.tree_flatten_with_path(getattr(scene, part), is_leaf=_is_sequence)[0]:
+            words = [str(getattr(key, "name", getattr(key, "idx", getattr(key, "key", key)))) for key in path]
             if part == "physics":  # names as in a scene file, for example support.0
                 part_of = scene.physics[: int(words[0]) + 1]
                 section = part_of[-1].section
@@ -258,6 +263,14 @@ def other_numbers(scene: Scene, varied: Mapping[str, np.ndarray | jax.Array]) ->
     return json.dumps(found | _course(scene))
 
 
+def _is_sequence(value: object) -> bool:
+    """Return whether a value is a tuple or a list of numbers. It has the same digest as an array of these numbers."""
+    if not isinstance(value, tuple | list) or not value:
+        return False
+    numbers = (int, float, np.generic, np.ndarray, jax.Array)
+    return all((isinstance(part, numbers) and np.ndim(part) == 0) or _is_sequence(part) for part in value)
+
+
 def _course(scene: Scene) -> Content:
     """Return {name: value} of the time integrator and of the duration [s] of the run (None without time)."""
     solve = scene.solve
@@ -265,15 +278,83 @@ def _course(scene: Scene) -> Content:
     return {"solve.integrator": solve.integrator, "solve.dt x solve.steps": duration}
 
 
+def loads_of_run(scene: Scene) -> dict[str, np.ndarray]:
+    """Return the lowest and the highest values (2, …) of each load and prescribed motion in a run, by name, with their
+    histories. The value 0 is always included, because a run begins at rest.
+
+    The values are those at the beginning and at the ends of the steps. They must be known (not inside jit, grad or
+    vmap).
+    """
+    found = {}
+    times = (0.0 if scene.solve.dt is None else float(scene.solve.dt)) * np.arange(scene.solve.steps + 1)
+    for section, key in _TIMED.items():
+        entries = getattr(scene, section)
+        parts = {f"{section}.{k}": part for k, part in enumerate(entries)} if key != "gravity" else {section: entries}
+        for name, part in parts.items():
+            value, history = getattr(part, key, None), getattr(part, "history", None)
+            if history is not None:
+                columns = np.asarray(history, float).reshape(len(history), -1).T
+                at = np.stack([np.interp(times, np.asarray(part.times), column) for column in columns], axis=-1)
+                values = at if value is None or np.ndim(history) == 2 else np.multiply.outer(at[:, 0], value)
+            elif value is not None:
+                values = np.asarray(value, float)[None]
+            else:
+                continue
+            ends = values.min(axis=0, initial=0.0), values.max(axis=0, initial=0.0)
+            found[f"{name}.{key} during the run"] = np.stack(ends) + 0.0  # -0 becomes 0
+    return found
+
+
+def _known_value(scene: Scene, name: str) -> np.ndarray | None:
+    """Return the value that a scene has for a dotted name, or None if the scene has no number with this name."""
+    try:
+        return np.asarray(numbers_at(scene, name), float)
+    except (InputError, TypeError):  # TypeError: the entry is None
+        return None
+
+
+def _is_outside(value: np.ndarray, bounds: np.ndarray | jax.Array) -> bool:
+    low, high = np.asarray(bounds)
+    return not np.all(np.maximum(low - value, value - high) <= BEYOND * (high - low) + 1e-9 * np.abs(high))
+
+
 def parameters_outside(model: ReducedModel, scene: Scene) -> list[str]:
-    """Return the names of the parameters that are outside their training range by more than `BEYOND` of its width. The
-    values must be known (not inside jit, grad or vmap)."""
+    """Return the names of the parameters that are outside their training range by more than `BEYOND` of its width, or
+    that the scene does not have. Then follow loads and motions whose values during the run (`loads_of_run`) are outside
+    their training range. The values must be known (not inside jit, grad or vmap)."""
     found = []
     for name, bounds in model.ranges.items():
-        value, (low, high) = np.asarray(numbers_at(scene, name), float), np.asarray(bounds)
-        if np.any(np.maximum(low - value, value - high) > BEYOND * (high - low) + 1e-9 * np.abs(high)):
+        value = _known_value(scene, name)
+        if value is None or _is_outside(value, bounds):
+            found.append(name)
+    if model.loads is None:
+        return found
+    for name, values in loads_of_run(scene).items():
+        told = any(other.startswith(name.split()[0]) for other in found)
+        if not told and _is_outside(values, model.loads.get(name, np.zeros(2))):
             found.append(name)
     return found
+
+
+def _sentence_of(model: ReducedModel, scene: Scene, name: str) -> str:
+    """Return an error message for one of the names from `parameters_outside`."""
+    if name in model.ranges:
+        given, bounds = _known_value(scene, name), model.ranges[name]
+        if given is None:
+            return (
+                f"the scene has no {name}, which differs between the training runs of the reduced model: add it to the "
+                "scene, or use lj.reduced_error"
+            )
+        value = np.array2string(given, precision=4)
+    else:
+        bounds = (model.loads or {}).get(name, np.zeros(2))
+        value = " to ".join(np.array2string(end, precision=4) for end in loads_of_run(scene)[name])
+    low, high = np.asarray(bounds)
+    return (
+        f"{name} = {value} is outside the training range of the reduced model ({np.array2string(low, precision=4)} to "
+        f"{np.array2string(high, precision=4)}) by more than {BEYOND:.0%} of its width. The stated error is not valid "
+        "there: use lj.reduced_error, or train the model with a wider range"
+    )
 
 
 def refuse_unseen_numbers(model: ReducedModel, scene: Scene) -> None:
@@ -281,21 +362,16 @@ def refuse_unseen_numbers(model: ReducedModel, scene: Scene) -> None:
     vmap is not checked.
 
     Raises:
-        InputError: a number that was varied in the training is outside its training range by more than `BEYOND`; a
-            number that was not varied, or the time integrator, differs from the training runs; or the run is longer
-            than the training runs.
+        InputError: a number that was varied in the training is missing, or it is outside its training range by more
+            than `BEYOND`; the values of a load or of a prescribed motion during the run are outside their training
+            range; a number that was not varied, or the time integrator, differs from the training runs; or the run is
+            longer than the training runs.
     """
     parts = [*(getattr(scene, part) for part in _PARTS), scene.solve.dt]
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((parts, model.ranges))):
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((parts, model.ranges, model.loads))):
         return
     for name in parameters_outside(model, scene):
-        value, (low, high) = np.asarray(numbers_at(scene, name), float), np.asarray(model.ranges[name])
-        raise InputError(
-            f"{name} = {np.array2string(value, precision=4)} is outside the training range of the reduced model "
-            f"({np.array2string(low, precision=4)} to {np.array2string(high, precision=4)}) by more than "
-            f"{BEYOND:.0%} of its width. The stated error is not valid there: use lj.reduced_error, or train the "
-            "model with a wider range"
-        )
+        raise InputError(_sentence_of(model, scene, name))
     if not model.others:
         return  # models of an earlier version of the program do not contain these digests
     made, own = json.loads(model.others), json.loads(other_numbers(scene, {n: b[0] for n, b in model.ranges.items()}))
@@ -317,4 +393,4 @@ def refuse_unseen_numbers(model: ReducedModel, scene: Scene) -> None:
 def without_rows(model: ReducedModel) -> ReducedModel:
     """Return the model without the data that are needed only for the correction and the stated error. Models that
     differ only in these data use the same compiled program."""
-    return replace(model, correction=None, ranges={}, others="")
+    return replace(model, correction=None, ranges={}, loads=None, others="")

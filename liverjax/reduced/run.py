@@ -9,9 +9,10 @@ import jax.numpy as jnp
 
 from liverjax.core import status
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, replace, struct
+from liverjax.core.struct import Number, param, replace, struct
 from liverjax.mesh.nodal import nodal_volumes
 from liverjax.mesh.promotion import on_middles
+from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End, Free, Step
 from liverjax.physics.loads import Loads, dead_loads
 from liverjax.physics.prescribed import prescribed
@@ -141,17 +142,21 @@ def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
     fluid = None if scene.porosity is None else fluid_at_rest(model, scene)
     if scene.solve.kind != "dynamic" or scene.body is None:
         return q, memory, fluid, None, inverse, None
-    density = jnp.asarray(scene.body.density)
-    if density.ndim == 0:  # the mass matrix is a multiple of the identity, because the modes are orthonormal
-        mass = density * jnp.eye(n, dtype=q.dtype)
-    else:
-        nodal = density * nodal_volumes(scene.mesh)
-        mass = jnp.tensordot(model.modes * nodal[None, :, None], model.modes, axes=((1, 2), (1, 2)))
+    mass = reduced_mass(model, scene.mesh, scene.body.density)
     newmark = scene.solve.integrator == "newmark"
     if newmark and fluid is not None and scene.porosity is not None and scene.porosity.initial_pressure is not None:
         load = load - _forces_of_fluid(model, scene, fluid)
     motion = ReducedMotion(q, jnp.linalg.solve(mass, load) if newmark else q, q, jnp.array(False))
     return q, memory, fluid, motion, inverse, mass
+
+
+def reduced_mass(model: ReducedModel, mesh: TetMesh, density: Number) -> jax.Array:
+    """Return the reduced mass matrix (n, n) [kg m^-3] of the n modes, for one density or one per node (V,) [kg/m^3]."""
+    given = jnp.asarray(density)
+    if given.ndim == 0:  # the mass matrix is a multiple of the identity, because the modes are orthonormal
+        return given * jnp.eye(model.number_of_modes, dtype=model.modes.dtype)
+    nodal = given * nodal_volumes(mesh)
+    return jnp.tensordot(model.modes * nodal[None, :, None], model.modes, axes=((1, 2), (1, 2)))
 
 
 def _forces_of_fluid(model: ReducedModel, scene: Scene, fluid: ReducedFluid) -> jax.Array:

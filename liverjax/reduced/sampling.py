@@ -18,6 +18,7 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
 from liverjax.elements import mjed
 from liverjax.physics.base import End, Free, Step
+from liverjax.physics.inertia import FACTOR
 from liverjax.physics.registry import law_at_rest
 from liverjax.physics.viscosity import initial_history
 from liverjax.reduced.model import ReducedModel, as_matrix, solid_at_points
@@ -30,7 +31,7 @@ from liverjax.reduced.physics.fluid import (
     volume_stress,
 )
 from liverjax.reduced.physics.supports import reduced_springs
-from liverjax.reduced.run import prescribed_gradients
+from liverjax.reduced.run import prescribed_gradients, reduced_mass
 from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.tensors.matrices import determinant
@@ -125,11 +126,15 @@ def states_of(runs: int, steps: int) -> list[tuple[int, np.ndarray]]:
 
 def _reduced_compliance(whole: ReducedModel, scene: Scene) -> np.ndarray:
     """Return the reduced compliance (n, n) [m^4/N] of n modes: the inverse of the reduced stiffness at the reference
-    shape."""
+    shape. In dynamics the stiffness includes the inertia in one time step, as in the tangent of a step."""
     modes = np.asarray(whole.modes).reshape(whole.number_of_modes, -1)
     K = mjed.stiffness_matrix(scene.mesh, law_at_rest(by_element(scene)), scene.mesh.points)
     springs = reduced_springs(whole.modes, scene)
-    return np.linalg.inv(modes @ (K @ modes.T) + (0.0 if springs is None else np.asarray(springs)))
+    stiffness, solve = modes @ (K @ modes.T) + (0.0 if springs is None else np.asarray(springs)), scene.solve
+    if solve.kind == "dynamic" and scene.body is not None:
+        mass = np.asarray(reduced_mass(whole, scene.mesh, scene.body.density))
+        stiffness = stiffness + FACTOR[solve.integrator] / float(np.asarray(solve.dt)) ** 2 * mass
+    return np.linalg.inv(stiffness)
 
 
 @jax.jit

@@ -15,7 +15,7 @@ from liverjax.core.struct import replace
 from liverjax.mesh.nodal import integrals, nodal_volumes
 from liverjax.physics.prescribed import free_degrees
 from liverjax.reduced.correction import FEWEST_RUNS, Correction, Learnt, correction_at, learnt_correction
-from liverjax.reduced.model import ReducedModel, other_numbers, refuse_unknown_physics, with_all_points
+from liverjax.reduced.model import ReducedModel, loads_of_run, other_numbers, refuse_unknown_physics, with_all_points
 from liverjax.reduced.run import simulate_reduced
 from liverjax.reduced.sampling import Coordinates, sampled
 from liverjax.scenes.scene import Scene, with_parameters
@@ -24,6 +24,9 @@ from liverjax.tensors.principal_fields import principal_fields
 
 #: Displacements below this fraction of the body's size are regarded as 0.
 _ROUNDOFF = 1e-13
+#: A run is at rest if its largest displacement is at most this fraction of the largest displacement in all runs [1].
+#: Smaller displacements are roundoff.
+_AT_REST = 1e-9
 #: Maximum number of displacement modes, divided by the maximum number of pressure modes.
 PRESSURES = 2
 
@@ -151,8 +154,17 @@ def _model_of(scene: Scene, runs: _Runs, tolerance: float, most_modes: int, poin
     q = jnp.einsum("rtvc,nvc->rtn", u * volumes[:, None], whole.modes)
     model = sampled(whole, scene, runs.values, Coordinates(q, p), point_tolerance)
     ranges = {name: jnp.asarray(np.stack([v.min(axis=0), v.max(axis=0)])) for name, v in runs.values.items()}
-    model = replace(model, ranges=ranges, others=other_numbers(scene, {n: v[0] for n, v in runs.values.items()}))
+    model = replace(model, ranges=ranges, loads=_loads_of_rows(scene, runs))
+    model = replace(model, others=other_numbers(scene, {n: v[0] for n, v in runs.values.items()}))
     return replace(model, correction=_learnt_from(model, scene, runs))
+
+
+def _loads_of_rows(scene: Scene, runs: _Runs) -> dict[str, jax.Array]:
+    """Return the lowest and the highest values (2, …) of each load and prescribed motion in all runs, by name."""
+    rows = [{name: value[r] for name, value in runs.values.items()} for r in range(len(runs.u))]
+    loads = [loads_of_run(with_parameters(scene, row)) for row in rows]
+    low, high = ({name: np.stack([own[name][k] for own in loads]) for name in loads[0]} for k in range(2))
+    return {name: jnp.asarray(np.stack([low[name].min(axis=0), high[name].max(axis=0)])) for name in low}
 
 
 def _pressure_fields(scene: Scene, P: np.ndarray, tolerance: float, most: int) -> tuple[jax.Array, np.ndarray]:
@@ -166,7 +178,7 @@ def _pressure_fields(scene: Scene, P: np.ndarray, tolerance: float, most: int) -
 def _learnt_from(model: ReducedModel, scene: Scene, runs: _Runs) -> Correction | None:
     q, failed = _coordinates_of_rows(model, scene, runs.values)
     moved = np.linalg.norm(runs.u, axis=-1).max(axis=(1, 2))
-    good = ~failed & (moved > 1e-9 * moved.max(initial=0.0))  # smaller displacements are roundoff of a body at rest
+    good = ~failed & (moved > _AT_REST * moved.max(initial=0.0))
     missing = runs.u[good] - np.tensordot(q[good], np.asarray(model.modes), axes=1)
     volumes = np.asarray(nodal_volumes(scene.mesh))
     return learnt_correction(Learnt(q[good], missing, moved[good], volumes, scene.solve.dt))
@@ -189,16 +201,18 @@ def _coordinates_of_rows(
 
 def _errors_of_rows(model: ReducedModel, scene: Scene, values: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return for each row the largest correction of a node, divided by the largest displacement [1]. If the model has
-    no correction, return the largest displacement [m] instead. The value of a failed run is -1."""
+    no correction, return the largest displacement [m] instead. The value of a run at rest is 0, and that of a failed
+    run is -1."""
     q, failed = _coordinates_of_rows(model, scene, values)
-    found = np.zeros(len(q))
+    found, moved = np.zeros(len(q)), np.zeros(len(q))
     for k, own in enumerate(q):
-        u = np.linalg.norm(np.tensordot(own, np.asarray(model.modes), axes=1), axis=-1).max()
+        u = moved[k] = np.linalg.norm(np.tensordot(own, np.asarray(model.modes), axes=1), axis=-1).max()
         if model.correction is None:
             found[k] = u
             continue
         off = np.linalg.norm(np.asarray(correction_at(model.correction, jnp.asarray(own), scene.solve.dt)), axis=-1)
         found[k] = off.max() / max(u, 1e-300)
+    found[moved <= _AT_REST * moved[~failed].max(initial=0.0)] = 0.0
     # Parameter sets whose reduced run failed are chosen last, because the full run would probably fail too.
     return np.where(failed, -1.0, found)
 
