@@ -120,6 +120,15 @@ def test_raw_columns_of_one_of_two_joined_sweeps_are_used():
     assert any("16 of 32 points have an empty cell in the raw columns" in note for note in shown.notes)
 
 
+def test_raw_columns_of_all_joined_sweeps_are_enough():
+    """If only one of two tables had a phase, the torques of the other were not used, and the inertia was not found."""
+    omega = np.geomspace(1, 300, 16)
+    one, other = exact(omega), exact(omega * 1.01)
+    raw = {"torque": omega, "angle": omega}
+    both = temperature_sweeps.joined([one._replace(raw=raw | {"phase": omega}), other._replace(raw=raw)])
+    assert sorted(both.raw) == ["angle", "torque"] and np.isfinite(both.raw["torque"]).all()
+
+
 def test_joined_sweeps_name_the_first_file_and_count_the_others():
     """Messages began with the paths of all files."""
     three = [exact(np.array([1.0, 2.0]))._replace(source=f"x, y/{k}.csv") for k in range(3)]

@@ -210,7 +210,10 @@ def _master(options: argparse.Namespace) -> tuple["Sweep", dict, str]:
     data = temperature_sweeps.read_temperatures(options.sweep)
     band = options.min_frequency, options.max_frequency
     data = temperature_sweeps.with_usable_points(data, band, options.radius, options.height)
-    found = master_curve.master_curve(data, reference, options.vertical)
+    try:
+        found = master_curve.master_curve(data, reference, options.vertical)
+    except InputError as error:  # an ignored temperature may be the cause
+        raise InputError("; ".join([str(error), *data.sweeps[0].notes])) from None
     files = ("shift_factors.csv", "master_curve.csv", "shift.png", "fit.json", "fit.png", "fit.h5")
     shared_options.prepare_outputs(options, files, [*options.sweep, *options.predict])
     master_report.write_master_curve(options.out, found)

@@ -66,6 +66,11 @@ def master_curve(data: AtTemperatures, reference: float | None, vertical: bool =
         log_a = np.log10(data.shift_factors)
         if reference is None:  # the given factors refer to the temperature with the factor 1
             place = int(np.argmin(np.abs(log_a)))
+            if log_a[place] != 0:
+                untold.append(
+                    f"no temperature has the shift factor 1, so the reference is {celsius(T[place]):.4g} °C, and the "
+                    f"given factors are divided by {data.shift_factors[place]:.4g}"
+                )
         found = shifts.known_shifts(data.sweeps, T, place, log_a - log_a[place])
     else:
         found = shifts.found(data.sweeps, T, place, vertical)

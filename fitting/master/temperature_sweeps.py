@@ -163,9 +163,9 @@ def _index_of_group(T: np.ndarray, exact: bool) -> np.ndarray:
 
 
 def joined(sweeps: Sequence[Sweep]) -> Sweep:
-    """Return one sweep with all points of several sweeps, sorted by frequency. It has standard deviations if all
-    sweeps have them, and all raw columns of the instrument. Where a sweep has no such column, its values are NaN. Other
-    raw columns are kept if all sweeps have them."""
+    """Return one sweep with all points of several sweeps, sorted by frequency. It has standard deviations and raw
+    columns if all sweeps have them. If no raw column of the instrument is in all sweeps, it has each of these columns,
+    with NaN for the other sweeps."""
     omega = np.concatenate([s.angular_frequency for s in sweeps])
     order = np.argsort(omega, kind="stable")
     storage, loss = (np.concatenate([getattr(s, q) for s in sweeps])[order] for q in ("storage", "loss"))
@@ -181,7 +181,9 @@ def joined(sweeps: Sequence[Sweep]) -> Sweep:
     files = tuple(dict.fromkeys(file for s in sweeps for file in s.files or (s.source,)))
     more = f" and {len(files) - 1} more file{'s' if len(files) > 2 else ''}" if len(files) > 1 else ""
     raws, greys = [s.raw or {} for s in sweeps], [s.grey for s in sweeps if s.grey is not None]
-    names = [q for q in {q for raw in raws for q in raw} if q in raw_torque.COLUMNS or all(q in raw for raw in raws)]
+    names = [q for q in raws[0] if all(q in raw for raw in raws)]
+    if not set(names) & set(raw_torque.COLUMNS):
+        names += sorted({q for raw in raws for q in raw} & set(raw_torque.COLUMNS))
     columns = {
         q: [raw.get(q, np.full(len(s.loss), np.nan)) for s, raw in zip(sweeps, raws, strict=True)] for q in names
     }
