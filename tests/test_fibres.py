@@ -241,4 +241,5 @@ def test_directions_of_regions_are_compared_within_each_element():
     jax.jit(lambda k: check(law, region([1, 2], fibre=(0.0, 0.0, k))))(1.0)  # unknown directions are not checked
     with pytest.raises(lj.InputError, match=r"region.0: law costa"):
         jax.jit(lambda c: check(replace(law, c=c), region([1, 2], fibre=z)))(1.0)
-    check(law, region([n], fibre=z))  # wrong element numbers are refused by another check
+    with pytest.raises(lj.InputError, match=f"region.0 has no elements, or element numbers outside 0 to {n - 1}"):
+        check(law, region([n], fibre=z))

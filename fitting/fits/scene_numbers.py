@@ -339,6 +339,8 @@ _AT_BOUND = 0.01
 
 def _told_of_bounds(found: Estimate, upper: np.ndarray) -> Estimate:
     """Return the estimate. If a parameter is at its bound in `upper` (n,), a warning is given and added."""
+    if not np.isfinite(upper).any():
+        return found
     errors = np.where(np.isfinite(found.standard_errors), found.standard_errors, 0.0)
     (places,) = np.nonzero(np.isfinite(upper) & (upper - found.values <= _AT_BOUND * errors))
     if not len(places):
