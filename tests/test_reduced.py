@@ -1,7 +1,5 @@
 """Reduced models: the full model in other coordinates, their structure, their error, and unsupported scenes."""
 
-from types import SimpleNamespace
-
 import h5py
 import jax
 import jax.numpy as jnp
@@ -12,10 +10,8 @@ from conftest import every_motion, moves_as_full
 import liverjax as lj
 from liverjax.core import status
 from liverjax.core.struct import replace
-from liverjax.mesh.nodal import nodal_volumes
-from liverjax.physics.prescribed import free_degrees
-from liverjax.reduced import estimate, sampling, training
-from liverjax.reduced.correction import Learnt, _least_squares, correction_at, learnt_correction, stated_at
+from liverjax.reduced import estimate, training
+from liverjax.reduced.correction import Learnt, learnt_correction, stated_at
 from liverjax.reduced.model import (
     as_matrix,
     refuse_unknown_physics,
@@ -23,9 +19,7 @@ from liverjax.reduced.model import (
     solid_at_points,
     with_all_points,
 )
-from liverjax.reduced.sampling import MOST_STATES, Coordinates, nonnegative_weights, sampled, states_of
-from liverjax.reduced.step import _updated
-from liverjax.reduced.tangent import ReducedTangent, in_single_precision, solved_by_tangent, tangent_matrix
+from liverjax.reduced.sampling import Coordinates, sampled
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -61,18 +55,6 @@ def test_the_error_of_a_body_that_is_about_to_buckle():
     away = np.asarray(lj.reduced_positions(model, pressed, run) - lj.simulate(pressed).check().positions)
     true = np.linalg.norm(away, axis=-1).max()
     assert 0.5 < float(lj.reduced_error(model, pressed, run).error.max()) / true < 2
-
-
-@pytest.mark.parametrize("order", [1, 2])
-def test_the_compliance_of_the_selection_of_points_has_regions(order):
-    """The changes of the law in regions were not used, so motions were up to ten times too large in a stiff region."""
-    scene, stiff = _bar((3, 1, 1), order), np.arange(9)
-    mu = jnp.full(scene.mesh.number_of_elements, 800.0).at[stiff].set(8000.0)
-    scene = replace(scene, region=(lj.Region(elements=stiff, law={"mu": 8000.0}),))
-    modes = SimpleNamespace(modes=every_motion(scene), number_of_modes=len(every_motion(scene)))
-    found = sampling._reduced_compliance(modes, scene)
-    same = replace(scene, region=(), law=replace(scene.law, mu=scene.mesh.at_points(mu)))
-    np.testing.assert_allclose(found, sampling._reduced_compliance(modes, same), rtol=1e-9)
 
 
 @pytest.mark.parametrize("factor", [np.nan, 0.0, -1.0])
@@ -171,17 +153,6 @@ def trained() -> tuple:
     return scene, model, batch.result.positions[8:]
 
 
-@pytest.mark.parametrize("runs", [1, 8, MOST_STATES // 2 + 1, 3 * MOST_STATES])
-def test_states_of_all_times_are_sampled(runs):
-    """With many runs each gives few states. These are from all times, not only from the first step."""
-    found = states_of(runs, 24)
-    times = np.concatenate([times for _, times in found])
-    assert len(times) <= MOST_STATES and times.min() >= 0 and times.max() < 24
-    assert len({r for r, _ in found}) == min(runs, MOST_STATES)
-    thirds = np.bincount(times // 8, minlength=3) / len(times)
-    assert np.all(thirds > 0.25)  # a third each, apart from a few at the ends
-
-
 @pytest.mark.ci
 def test_the_reduced_force_is_the_gradient_of_the_reduced_energy(trained):
     scene, model, *_ = trained
@@ -209,51 +180,6 @@ def _weight(scene: lj.Scene) -> np.ndarray:
     return 1000.0 * per_node[:, None] * np.asarray(scene.body.gravity)
 
 
-def test_weights_give_all_forces_and_are_few():
-    rng = np.random.default_rng(0)
-    G = rng.normal(size=(40, 6)) @ rng.normal(size=(6, 200))
-    xi = nonnegative_weights(G, np.ones(200), 1e-8)
-    assert np.all(xi >= 0) and np.count_nonzero(xi) <= 7
-    assert np.allclose(G @ xi, G.sum(axis=1), rtol=0, atol=1e-8 * np.abs(G).sum(axis=1).max())
-    with pytest.raises(lj.InputError, match="no state of the training runs has a motion with finite stresses"):
-        nonnegative_weights(G[:0], np.ones(200), 1e-8)
-
-
-def test_an_inverse_follows_the_forces_and_stays_symmetric_and_positive():
-    rng = np.random.default_rng(7)
-    half, moved = rng.normal(size=(6, 6)), rng.normal(size=6)
-    inverse, stiffness = np.eye(6), half @ half.T + np.eye(6)
-    change = stiffness @ moved
-    found = np.asarray(_updated(jnp.asarray(inverse), jnp.asarray(moved), jnp.asarray(change)))
-    # The secant condition holds up to rounding. The update is positive for positive work (Dennis, Schnabel 1983,
-    # theorem 9.2.1).
-    assert np.allclose(found @ change, moved, rtol=0, atol=1e-12 * np.abs(moved).max())
-    assert np.array_equal(found, found.T) and np.linalg.eigvalsh(found)[0] > 0
-    assert np.array_equal(_updated(jnp.asarray(inverse), jnp.asarray(moved), -jnp.asarray(change)), inverse)
-    assert np.array_equal(_updated(jnp.asarray(inverse), jnp.zeros(6), jnp.zeros(6)), inverse)
-
-
-@pytest.mark.parametrize("small", [1e-1, 1e-9])
-def test_solves_are_exact_though_the_inverse_is_near(small):
-    """This holds also if single precision loses a small eigenvalue of the matrix."""
-    rng, n, S = np.random.default_rng(2), 8, 20
-    half, slopes = rng.normal(size=(9, 9, S)), rng.normal(size=(9, S, n))
-    slopes[..., -1] = slopes[..., 0] + np.sqrt(small) * slopes[..., -1]
-    moduli = jnp.asarray(np.einsum("iks,jks->ijs", half, half))
-    b = jnp.asarray(rng.normal(size=n))
-
-    def both(stiffer):
-        K = ReducedTangent(jnp.asarray(slopes), stiffer * moduli, jnp.zeros((n, n)))
-        return solved_by_tangent(K, in_single_precision(K.slopes), b), tangent_matrix(K)
-
-    (x, K), (change, _) = jax.jit(lambda one: jax.jvp(both, (one,), (one,)))(jnp.ones(()))
-    exact = np.linalg.solve(K, b)
-    # Rounding times the condition number, which is some thousands over the small number.
-    limit = 1e-12 / small * np.abs(exact).max()
-    assert np.allclose(x, exact, rtol=0, atol=limit)
-    assert np.allclose(change, -exact, rtol=0, atol=limit)
-
-
 @pytest.mark.ci
 def test_a_state_that_is_inside_out_or_at_rest_has_no_say_in_the_points(trained):
     scene, model, *_ = trained
@@ -266,27 +192,6 @@ def test_a_state_that_is_inside_out_or_at_rest_has_no_say_in_the_points(trained)
     beside = sampled(whole, scene, {"law.mu": np.array([mu, mu])}, both, 1e-3)
     assert len(alone.points) > 1
     assert np.array_equal(alone.points, beside.points) and np.allclose(alone.weights, beside.weights, rtol=1e-9)
-
-
-@pytest.mark.ci
-def test_points_of_a_body_that_is_only_moved():
-    """Without a load the forces cancel, so states were divided by roundoff or were regarded as at rest."""
-    scene = replace(_bar((2, 1, 1)), body=None)
-    end = jnp.asarray(lj.boundary.select(scene.mesh, {"x_min": 0.03}, None, "displaced"))
-    scene = replace(scene, displaced=(lj.Displaced(nodes=end, by=jnp.array([0.003, 0.0, 0.002])),))
-    values = {"displaced.0.by": np.array([[0.003, 0, 0.002], [0.001, 0, 0.003], [0.002, 0.002, 0], [-0.002, 0.001, 0]])}
-    u = np.asarray(lj.simulate_batch(scene, values).result.positions) - np.asarray(scene.mesh.points)
-    u = u * np.asarray(free_degrees(scene.mesh, scene.fixed, scene.displaced))
-    volumes = np.asarray(nodal_volumes(scene.mesh))
-    whole = with_all_points(scene, jnp.asarray(training.proper_modes(u[:, 0], volumes, 1e-8)))
-    q = jnp.einsum("rtvc,nvc->rtn", u * volumes[:, None], whole.modes)
-    model = sampled(whole, scene, values, Coordinates(q, None), 1e-8)
-    compliance = sampling._reduced_compliance(whole, scene)
-    for by, own in zip(values["displaced.0.by"], q, strict=True):
-        moved = lj.with_parameters(scene, {"displaced.0.by": by})
-        forces, _ = sampling._contributions(model, moved, (own, None), jnp.arange(1))
-        motion = compliance @ np.asarray(forces[0]).sum(axis=1)  # of the forces that do not cancel
-        assert np.linalg.norm(motion) < 1e-7 * np.linalg.norm(own)
 
 
 def test_the_error_is_stated(trained):
@@ -310,52 +215,6 @@ def _missing(q: np.ndarray, fields: np.ndarray) -> np.ndarray:
     rates = np.diff(q, axis=1, prepend=0.0) / 0.1
     parts = np.stack([0.3 * q[..., 0] - 0.1 * q[..., 2], 2.0 * q[..., 0] * q[..., 1] - 0.01 * rates[..., 1]], axis=-1)
     return np.tensordot(parts, fields, axes=1)
-
-
-def test_a_polynomial_of_the_coordinates_is_learnt():
-    rng = np.random.default_rng(3)
-    volumes, fields = rng.uniform(0.5, 2.0, 7), rng.normal(size=(2, 7, 3))
-    q, new = (np.cumsum(rng.normal(size=(n, 6, 3)), axis=1) for n in (40, 5))
-    moved = np.abs(q).max(axis=(1, 2))
-    found = learnt_correction(Learnt(q, _missing(q, fields), moved, volumes, 0.1))
-    assert found is not None and found.products > 0
-    for own, exact in zip(new, _missing(new, fields), strict=True):
-        # The ridge of 1e-6 causes an error of about this size.
-        assert np.abs(correction_at(found, jnp.asarray(own), 0.1) - exact).max() < 1e-4 * np.abs(exact).max()
-        assert float(stated_at(found, jnp.asarray(own), jnp.asarray(exact), 0.1).max()) < 1e-3 * np.abs(exact).max()
-    noise = rng.normal(size=(40, 6, 7, 3))
-    # Noise that does not depend on the coordinates is not corrected, nor what only a few runs show.
-    assert learnt_correction(Learnt(q, noise, moved, volumes, 0.1)) is None
-    assert learnt_correction(Learnt(q[:5], _missing(q[:5], fields), moved[:5], volumes, 0.1)) is None
-
-
-def test_differences_count_in_proportion_to_the_motion_of_their_run():
-    rng = np.random.default_rng(8)
-    A, parts, moved = rng.normal(size=(20, 5, 4)), rng.normal(size=(20, 5, 3)), np.geomspace(1e-3, 1.0, 20)
-    factors, _ = _least_squares(A, parts, moved, np.arange(20) % 4).without()
-    by_motion = moved[:, None, None]
-    exact = np.linalg.lstsq((A / by_motion).reshape(100, 4), (parts / by_motion).reshape(100, 3), rcond=None)[0]
-    # The ridge of 1e-6 causes an error of about this size.
-    assert np.allclose(factors, exact, rtol=0, atol=1e-4 * np.abs(exact).max())
-
-
-def test_stated_errors_are_right_as_often_as_those_of_runs_left_out():
-    """A cubic term is not in a polynomial of degree two, so an error remains. The runs have different amplitudes."""
-    rng = np.random.default_rng(4)
-    volumes, fields = np.ones(7), rng.normal(size=(1, 7, 3))
-    q, new = (rng.uniform(-1.0, 1.0, (n, 6, 2)) * rng.uniform(0.5, 1.0, (n, 1, 1)) for n in (80, 200))
-    exact = [np.tensordot(a[..., :1] + 0.3 * a[..., :1] ** 3, fields, axes=1) for a in (q, new)]
-    moved = [np.linalg.norm(a, axis=-1).max(axis=(1, 2)) for a in exact]
-    found = learnt_correction(Learnt(q, exact[0], moved[0], volumes, None))
-    corrected = jax.jit(jax.vmap(lambda own: correction_at(found, own, None)))(jnp.asarray(new))
-    true = np.linalg.norm(corrected - exact[1], axis=-1).max(axis=(1, 2))
-    stated = jax.jit(jax.vmap(lambda q, u: stated_at(found, q, u, None)))(jnp.asarray(new), jnp.asarray(exact[1]))
-    within = lambda ratios: float(np.mean(np.abs(np.log(ratios)) < np.log(2)))  # noqa: E731
-    told, seen = within(np.asarray(found.ratios)), within(np.asarray(stated)[:, -1] / true)
-    assert told > 0.5
-    # Binomial: three standard deviations of both, for 80 runs left out and 200 new ones.
-    spread = told * (1 - told) * (1 / 80 + 1 / 200)
-    assert abs(seen - told) < 3 * np.sqrt(spread) + 1 / 80
 
 
 @pytest.mark.ci

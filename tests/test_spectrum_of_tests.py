@@ -6,7 +6,8 @@ from functools import partial
 import numpy as np
 import pytest
 import scipy.optimize
-from test_models import FORMULAS, TRUTHS, box_spectrum
+from test_models import FORMULAS, TRUTHS
+from test_relaxation_spectrum import box_spectrum
 from test_springpots_in_time import TIMES, inverse_laplace
 
 from fitting.__main__ import main
