@@ -11,7 +11,7 @@ import liverjax as lj
 from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
 from liverjax.mesh.surface import areas as triangle_areas
-from liverjax.physics.contact.obstacle import Obstacle, contact_force
+from liverjax.physics.contact.obstacle import Obstacle, touching_term
 from liverjax.physics.contact.shapes import SHAPES, distance
 from liverjax.scenes.scene_file import scene_from
 
@@ -102,11 +102,11 @@ def test_a_body_is_pulled_off_a_plane_in_few_iterations(gap):
     scene = lying()
     x = scene.mesh.points
     plane = replace(scene.physics[0], position=jnp.array([0.0, 0.0, -gap]), stiffness=1e10)
-    unit = jnp.zeros_like(x).at[:, 2].set(1.0)
+    unit, term = jnp.zeros_like(x).at[:, 2].set(1.0), touching_term(plane, scene.mesh, jnp.zeros((2, 3)))
 
     @jax.jit
     def force(u):
-        return jax.jvp(lambda u: contact_force(plane, scene.mesh, x + u * unit, jnp.zeros(3))[:, 2].sum(), (u,), (1.0,))
+        return jax.jvp(lambda u: term.force(scene.mesh, x + u * unit, 1.0)[:, 2].sum(), (u,), (1.0,))
 
     of_body, up, u = 1e-2 * float(force(0.0)[1]), 1e-8, 0.0
     assert of_body > 0  # the surface touches the plane

@@ -26,7 +26,6 @@ from liverjax.physics.contact.obstacle import (
     between_nodes,
     contact_points,
     distances,
-    just_touching,
     point_functions,
     shared_out,
     touching_nodes,
@@ -79,6 +78,8 @@ class RoughObstacle(Obstacle):
             obstacle=plain.obstacle,
             at_end=plain.at_end,
             moved=moved,
+            near=plain.near,
+            reach=plain.reach,
             slip=slip,
             past=past,
             friction=self.friction,
@@ -128,13 +129,13 @@ class Rubbing(Touching):
         trial = self.slip + at - self.now(s)[:, None, None] - self.past
         return trial - n * jnp.sum(n * trial, axis=0, keepdims=True)
 
-    def _guessed(self, mesh: TetMesh, at: jax.Array, s: Number) -> jax.Array:
+    def _guessed(self, at: jax.Array, s: Number) -> jax.Array:
         """Return a mask (1, 1, Q, m) of the points with friction that just touch the obstacle and are not inside it.
 
         In the tangent, such points count as pressed and sticking.
         """
         d = distances(self.obstacle, at, self.now(s))
-        return (just_touching(self.obstacle, mesh, d) & (d.value >= 0) & (self.friction > 0))[None, None]
+        return (self.touches(d) & (d.value >= 0) & (self.friction > 0))[None, None]
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
         """Return the nodal forces (V, 3) [N] due to contact pressure and frictional shear, times -1."""
@@ -146,7 +147,7 @@ class Rubbing(Touching):
         at, plain = self.points(x), super().attached(mesh, x, s)
         units = [jnp.zeros_like(at).at[j].set(1.0) for j in range(3)]
         H = jnp.stack([jax.jvp(lambda at: self.slip_at(at, s), (at,), (unit,))[1] for unit in units], axis=1)
-        return self._with_shear(mesh, plain, jnp.where(self._guessed(mesh, at, s), _planes(self._law(at, s)[0]), H))
+        return self._with_shear(mesh, plain, jnp.where(self._guessed(at, s), _planes(self._law(at, s)[0]), H))
 
     def energy_from(self, mesh: TetMesh, x: jax.Array, start: jax.Array) -> jax.Array:
         """Return the energy [J] of the contact, plus an energy of the slip.
@@ -172,7 +173,7 @@ class Rubbing(Touching):
         slides, way = (size > most)[None, None], trial / size[None]
         H = _planes(n) - jnp.where(slides, way[:, None] * way[None], 0.0)
         H = jnp.where(slides, (most / size)[None, None], 1.0) * H
-        return self._with_shear(mesh, plain, jnp.where(self._guessed(mesh, at, s), _planes(n), H))
+        return self._with_shear(mesh, plain, jnp.where(self._guessed(at, s), _planes(n), H))
 
     def _with_shear(self, mesh: TetMesh, plain: Attached, H: jax.Array) -> Attached:
         """Return the stiffness `plain` of the pressures plus that of the shear (`stiffness` times H (3, 3, Q, m))."""

@@ -26,7 +26,7 @@ from jax.typing import DTypeLike
 from liverjax.core import bounds, history
 from liverjax.core.did_you_mean import as_word, hint
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Content, Indices, Number, Numbers, param, replace, static, struct
+from liverjax.core.struct import Array, Content, Indices, Number, Numbers, param, replace, static, struct
 from liverjax.laws.base import Law
 from liverjax.mesh import promotion, selection, surface
 from liverjax.mesh.shape_functions import triangle_rule
@@ -40,7 +40,7 @@ from liverjax.solvers.attached import Attached
 #: triangle is wide.
 HARDNESS = 100.0
 #: A point counts as touching if its distance, divided by the size of a triangle, is at most `_TOUCHING`. In the
-#: reference shape, the limit is `_NEAR`: nodes of files in float32 have roundoff (see `just_touching`).
+#: reference shape, the limit is `_NEAR`: nodes of files in float32 have roundoff (see `reach_of_touch`).
 _TOUCHING, _NEAR = 1e-9, 1e-6
 #: Weights (Q,) and barycentric coordinates (3, Q) of Q = 3 contact points of a triangle (integration rule of degree 2).
 _POINTS = np.full(3, 1 / 3), np.full((3, 3), 1 / 6) + 0.5 * np.eye(3)
@@ -200,7 +200,7 @@ class Obstacle(Physics):
         moved = jnp.stack([self.displacement(n, step.steps, dt) for n in (step.k - 1, step.k)])
         # Newmark's method uses only the force at the end of the step, doubled (`liverjax.physics.inertia`).
         own = replace(self, stiffness=2 * jnp.asarray(self.stiffness)) if step.averaged else self
-        return Touching(obstacle=own, moved=moved.astype(step.x.dtype), at_end=step.averaged)
+        return touching_term(own, step.mesh, moved.astype(step.x.dtype), step.averaged)
 
 
 @struct
@@ -209,6 +209,8 @@ class Touching(NodalForce):
 
     obstacle: Obstacle = param("1", "shape and stiffness")
     moved: jax.Array = param("m", "displacement at the beginning and at the end of the step (2, 3)")
+    near: Array = param("m", "maximum distance of points that touch (m,)")
+    reach: Array = param("m", "the same if the obstacle presses on no point (Q, m)")
 
     at_end: bool = static(default=False)  # type: ignore[misc]
 
@@ -222,13 +224,21 @@ class Touching(NodalForce):
         """Return the displacement (3,) [m] of the obstacle at fraction s of the step, with the body at x (V, 3)."""
         return self.now(s)
 
+    def touches(self, d: Distance) -> jax.Array:
+        """Return whether points (Q, m) with distances `d` are inside the obstacle, or near enough to count as touching.
+
+        Points within their `reach` touch only if the obstacle presses on no point. Points that move away do not touch:
+        a stiffness would make their motion in Newton's method very slow.
+        """
+        near = self.near[None]
+        return (d.value <= near) | ((d.value <= self.reach) & jnp.all(d.value >= -near))
+
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
         """Return the contact forces (V, 3) [N] on the nodes, times -1 (the gradient of the contact energy)."""
-        return self.force_at(mesh, x, self.place(x, s))
-
-    def force_at(self, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> jax.Array:
-        """Return the same forces (V, 3) [N] as `force`, for an obstacle that is displaced by `moved` (3,) [m]."""
-        return contact_force(self.obstacle, mesh, x, moved)
+        d = _distances(self.obstacle, mesh, x, self.place(x, s))
+        depth = depths(d, self.touches(d))
+        push = weighted_stiffness(self.obstacle, mesh) * depth  # (Q, m) [N] contact force at each point, times -1
+        return shared_out(self.obstacle, mesh, x, jnp.stack([push * n for n in d.normal]))
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
         """Return the energy [J] of the contact: half of stiffness times depth squared."""
@@ -244,7 +254,7 @@ class Touching(NodalForce):
         depth = jnp.minimum(d.value, 0.0)
         # A surface that just touches counts as pressed. Otherwise a body on a plane would have no support in the first
         # iteration.
-        inside = just_touching(self.obstacle, mesh, d).astype(x.dtype)
+        inside = self.touches(d).astype(x.dtype)
         H = jnp.stack(
             [
                 jnp.stack([k * (inside * d.normal[i] * d.normal[j] + depth * d.bent[i][j]) for j in range(3)])
@@ -259,20 +269,15 @@ class Touching(NodalForce):
         The part due to the change of the normal is omitted, since the eigenvalues of this part are never positive.
         """
         d, k = _distances(self.obstacle, mesh, x, self.place(x, s)), weighted_stiffness(self.obstacle, mesh)
-        k = k * just_touching(self.obstacle, mesh, d).astype(x.dtype)
+        k = k * self.touches(d).astype(x.dtype)
         H = jnp.stack([jnp.stack([k * a * b for b in d.normal]) for a in d.normal])
         return Attached(touching_nodes(self.obstacle, mesh), between_nodes(mesh, H))
 
 
-def contact_force(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> jax.Array:
-    """Return the force (V, 3) [N] of each node on the obstacle. It is the gradient of the contact energy.
-
-    x (V, 3) are the positions of the body. The obstacle is displaced by `moved` (3,).
-    """
-    d = _distances(obstacle, mesh, x, moved)
-    depth = depths(d, just_touching(obstacle, mesh, d))
-    push = weighted_stiffness(obstacle, mesh) * depth  # (Q, m) [N] contact force at each point, times -1
-    return shared_out(obstacle, mesh, x, jnp.stack([push * n for n in d.normal]))
+def touching_term(obstacle: Obstacle, mesh: TetMesh, moved: jax.Array, at_end: bool = False) -> Touching:
+    """Return the force term of an obstacle that is displaced by `moved` (2, 3) [m] at both ends of a step."""
+    near, far = touching_distance(obstacle, mesh), reach_of_touch(obstacle, mesh)
+    return Touching(obstacle=obstacle, moved=moved, near=near, reach=far, at_end=at_end)
 
 
 def depths(d: Distance, touching: jax.Array) -> jax.Array:
@@ -357,22 +362,20 @@ def _distances(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array
     return distances(obstacle, contact_points(obstacle, mesh, x), moved)
 
 
-def just_touching(obstacle: Obstacle, mesh: TetMesh, d: Distance) -> jax.Array:
-    """Return whether points (Q, m) with distances `d` are inside the obstacle, or near enough to count as touching.
-
-    A body that lies on the obstacle may have a small gap, because of the roundoff of its nodes (see `_NEAR`). Points
-    that are not farther away than in the reference shape touch despite this gap, if the obstacle presses on no point.
-    Points that move away do not touch: a stiffness would make their motion in Newton's method very slow.
-    """
-    near = touching_distance(obstacle, mesh)[None]
-    gap = _distances(obstacle, mesh, mesh.points, obstacle.displacement(0, 1, 0.0)).value
-    at_gap = (gap <= _NEAR / _TOUCHING * near) & (d.value <= gap + near)
-    return (d.value <= near) | (at_gap & jnp.all(d.value >= -near))
-
-
 def touching_distance(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
     """Return the maximum distance (m,) [m] of a point that counts as touching, for each of m triangles."""
     return _TOUCHING * jnp.sqrt(_triangle_areas(obstacle, mesh))
+
+
+def reach_of_touch(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
+    """Return the maximum distances (Q, m) [m] at which points count as touching an obstacle that presses on no point.
+
+    A body that lies on the obstacle may have a small gap, because of the roundoff of its nodes (see `_NEAR`). Points
+    with such a gap in the reference shape touch despite the gap.
+    """
+    near = touching_distance(obstacle, mesh)[None]
+    gap = _distances(obstacle, mesh, mesh.points, obstacle.displacement(0, 1, 0.0)).value
+    return near + jnp.where((gap > 0) & (gap <= _NEAR / _TOUCHING * near), gap, 0.0)
 
 
 #: Minimum and maximum number of intervals along the edge of a triangle in the search for a depth between contact
@@ -423,9 +426,8 @@ def touches_without_pressure(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) ->
 
     The obstacle is at its initial position, and x (V, 3) are the positions of the body.
     """
-    d = _distances(obstacle, mesh, x, obstacle.displacement(0, 1, 0.0))
-    nothing = d.value >= -touching_distance(obstacle, mesh)[None]
-    return bool(just_touching(obstacle, mesh, d).any() & nothing.all())
+    d = _distances(obstacle, mesh, x, obstacle.displacement(0, 1, 0.0)).value
+    return bool((d <= reach_of_touch(obstacle, mesh)).any() & (d >= -touching_distance(obstacle, mesh)[None]).all())
 
 
 @partial(jax.jit, inline=True)

@@ -30,6 +30,7 @@ from liverjax.physics.contact.obstacle import (
     distances,
     near_points,
     point_functions,
+    reach_of_touch,
     shared_out,
     three_numbers,
     touching_distance,
@@ -152,6 +153,7 @@ class PressedObstacle(Obstacle):
             functions=point_functions(step.mesh, dtype),
             hardness=weighted_stiffness(self, step.mesh),
             near=touching_distance(self, step.mesh),
+            reach=reach_of_touch(self, step.mesh),
         )
 
     def advance(self, memory: jax.Array, acting: "Pressing", end: End) -> jax.Array:
@@ -177,7 +179,6 @@ class Pressing(Touching):
         "1", "shape functions of a triangle's nodes at its contact points (n, Q)", default=None
     )
     hardness: Any = param("N/m", "contact stiffness times area, for each contact point (Q, m)", default=None)
-    near: Any = param("m", "maximum distance of a point that counts as touching (m,)", default=None)
 
     def points(self, x: jax.Array) -> jax.Array:
         """Return the positions (3, Q, m) [m] of the contact points, at nodal positions x (V, 3)."""
@@ -205,7 +206,7 @@ class Pressing(Touching):
         derivative is that with respect to `travel`. `at` are the contact points.
         """
         d = distances(self.obstacle, at, travel * self.direction)
-        inside = d.value <= self.near[None]
+        inside = self.touches(d)
         depth, inside = depths(d, inside), inside.astype(at.dtype)
         along = sum(n * t for n, t in zip(d.normal, self.direction, strict=True))
         bent = sum(self.direction[i] * d.bent[i][j] * self.direction[j] for i in range(3) for j in range(3))
@@ -260,7 +261,7 @@ class Pressing(Touching):
         at = self.points(x)
         d = distances(self.obstacle, at, self.travel(at, s) * self.direction)
         towards = sum(n * t for n, t in zip(d.normal, self.direction, strict=True))
-        along = self.hardness * (d.value <= self.near[None]) * towards
+        along = self.hardness * self.touches(d) * towards
         pushes = jnp.stack([along * n for n in d.normal])
         if not definite:
             depth = self.hardness * jnp.minimum(d.value, 0.0)
