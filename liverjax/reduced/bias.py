@@ -31,7 +31,7 @@ def reduced_bias(
 
     Args:
         model, scene: the same arguments as for `simulate_reduced`.
-        values: dotted names of the parameters -> values that were identified with the model.
+        values: dotted names of the parameters -> values that were identified with the reduced model.
         observed: function of the positions (T, V, 3) [m] of the nodes. It returns the quantities that were fitted to
             the data, multiplied by the weights of the fit.
 

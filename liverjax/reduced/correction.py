@@ -1,19 +1,20 @@
-"""Correction of the error due to modes and sampled points (a closure of the reduced model). It is learnt from the full
-training runs.
+"""Correction of the error of a reduced model (closure). The error comes from the few modes and the few sampled points.
+It is learnt from the full training runs.
 
-The reduced model is run with the parameter sets of its training, for which full runs exist. The difference between the
-full and the reduced motion is approximated by a sum of fields. The coefficient of each field is a polynomial of the
-reduced coordinates: linear in all coordinates, and quadratic in the first few coordinates. In scenes with time, it also
-has terms with the time derivatives of the coordinates, and with products of coordinates and time derivatives. The
+The reduced model is run with the parameter sets of its full training runs. The difference between the full and the
+reduced motion is approximated by a sum of fields. The coefficient of each field is a polynomial of the reduced
+coordinates: linear in all coordinates, and quadratic in the first few coordinates. In scenes with time, the polynomial
+also has terms with the time derivatives of the coordinates, and with products of coordinates and time derivatives. The
 factors of the terms are found by least squares with a small ridge penalty (closures of reduced models: Ahmed, Pawar,
 San, Rasheed, Iliescu, Noack 2021, Phys. Fluids 33, 091301). The differences between full and reduced motion in each run
 are divided by the largest displacement of this run.
 
 In a cross-validation, the fit is repeated without one group of runs, for each group. The errors of the left-out runs
 determine how many coordinates have quadratic terms. These errors also give a model of the error of the corrected motion
-(the stated error). In this model, the logarithm of the error is linear in the logarithms of three numbers, which are
-known without a full run: the size of the correction, the largest displacement, and the leverage of the terms. The
-leverage is the variance of the least-squares prediction, divided by the variance of the data (Hoaglin, Welsch 1978).
+(the stated error). In this model, the logarithm of the relative error is linear in the logarithms of three numbers: the
+correction divided by the displacement, the displacement, and the leverage of the terms. These numbers are known without
+a full run. The leverage is the variance of the least-squares prediction, divided by the variance of the data (Hoaglin,
+Welsch 1978).
 """
 
 from functools import partial
@@ -34,7 +35,7 @@ PRODUCTS, RATES = (0, 6, 12, 20), 8
 #: RIDGE: ridge penalty, relative to the mean squares of the terms. OUTSIDE: fraction of the differences between full
 #: and reduced motion that the fields may neglect. MOST_FIELDS: maximum number of fields.
 RIDGE, OUTSIDE, MOST_FIELDS = 1e-6, 0.02, 150
-#: The fields are computed from evenly spaced training states. Their number is less than twice this value.
+#: The fields are computed from evenly spaced training states. The number of these states is less than twice this value.
 FIELD_STATES = 1500
 #: Prior values of the three exponents of the stated error. With few runs, the exponents stay close to these values.
 #: With the prior values, the stated error of the motion is a constant times the square root of the leverage.
@@ -71,7 +72,7 @@ class Learnt(NamedTuple):
 def terms(q: jax.Array, scale: Number, products: int, dt: Number | None) -> jax.Array:
     """Return the values (T, k) of the k terms of the polynomial at every step of a run that begins at rest.
 
-    The unit is 1, or 1/s for terms with a time derivative.
+    Terms with a time derivative have the unit 1/s, the other terms have the unit 1.
 
     Args:
         q: the n reduced coordinates at T steps (T, n) [m^2.5].
@@ -96,7 +97,7 @@ def correction_at(own: Correction, q: jax.Array, dt: Number | None) -> jax.Array
 
 
 def size_at(own: Correction, q: jax.Array, dt: Number | None) -> jax.Array:
-    """Return the largest correction (T,) [m] of a node position, over all steps up to each of T steps."""
+    """For each of T steps, return the largest correction (T,) [m] of a node position up to this step."""
     return jax.lax.cummax(_largest_of_steps(correction_at(own, q, dt)))
 
 
@@ -143,7 +144,8 @@ def _logarithms(corrected: jax.Array, moved: jax.Array, leverage: jax.Array) -> 
 
 
 class _LeftOut(NamedTuple):
-    """Maxima (R,) over the steps of each of R runs. The correction of a run is learnt without the group of the run."""
+    """Maxima (R,) over the steps of each of R runs. For each run, the correction is learnt without the group of this
+    run."""
 
     off: np.ndarray  # maximum error [m]
     corrected: np.ndarray  # maximum correction [m]
@@ -151,8 +153,8 @@ class _LeftOut(NamedTuple):
 
 
 def learnt_correction(runs: Learnt) -> Correction | None:
-    """Learn corrections with different numbers of quadratic terms, and return the one with the smallest errors of
-    left-out runs. Return None if there are too few runs, or if no correction reduces these errors."""
+    """Learn corrections with different numbers of quadratic terms, and return the correction with the smallest errors
+    in the left-out runs. Return None if there are too few runs, or if no correction reduces these errors."""
     R = len(runs.q)
     if R < FEWEST_RUNS or not np.any(runs.q):
         return None
@@ -191,8 +193,8 @@ def learnt_correction(runs: Learnt) -> Correction | None:
 def _left_out(
     A: np.ndarray, sums: "_LeastSquares", group: np.ndarray, missing: np.ndarray, fields: np.ndarray
 ) -> _LeftOut:
-    """Return error, correction and leverage of every run, with the correction that was learnt without the group of this
-    run.
+    """Return the error, the correction and the leverage of every run. For each run, the correction is learnt without
+    the group of this run.
 
     Args:
         A: values of the k terms of the polynomial in R runs (R, T, k).
@@ -215,9 +217,9 @@ def _statement(out: _LeftOut, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray
     """Return the constant and the exponents (4,) of the stated error, and the stated error divided by the true error
     (R,) for the R left-out runs.
 
-    The exponents come from a least-squares fit of the logarithms. With few runs they stay close to
-    `FEW_RUNS_EXPONENTS`. The constant is chosen so that the logarithms of the 1 % and 99 % quantiles of the ratio
-    between stated and true error have the same absolute value.
+    The exponents come from a least-squares fit of the logarithms. With few runs the exponents stay close to
+    `FEW_RUNS_EXPONENTS`. The constant is chosen for the ratio of the stated error to the true error: the product of the
+    1 % and 99 % quantiles of this ratio over the runs is 1.
     """
     x = np.asarray(_logarithms(*(jnp.asarray(a) for a in (out.corrected, moved, out.leverage))))
     y = np.log(np.maximum(out.off / moved, np.finfo(float).tiny)) - x @ FEW_RUNS_EXPONENTS

@@ -2,7 +2,7 @@
 
 The equations of the full model are evaluated for the reduced motion, step by step, with the history variables of
 viscosity in all elements. The out-of-balance forces r determine the error e of the motion. To first order, e is the
-solution of the linear equations of the same body,
+solution of the linearised equations of the body,
 
     M a(e) + K e - memory(e) = -r,
 
@@ -11,9 +11,9 @@ history variables. These variables are updated from step to step as in the full 
 is factorised once per run. So a step needs the forces of the full mesh and one linear solve, but no Newton iterations.
 In statics the energy norm of e is the dual norm of r. The estimate neglects terms of second order in e. Near buckling,
 the deformed body is much softer than the reference shape, and K then gives an error that is much too small. So in
-statics without a fluid, the response to the forces r at the step with the largest error is computed with the stiffness
-of the deformed body, and with that of the reference shape. If the first response is more than `SOFTER` times as large,
-all errors are multiplied by the ratio of the two responses.
+statics without a fluid, the response to r is computed twice at the step with the largest error: with the stiffness of
+the deformed body, and with the stiffness of the reference shape. If the first response is more than `SOFTER` times as
+large, all errors are multiplied by the ratio of the two responses.
 
 In a scene with a porous body, the fluid pressures on the full mesh are computed from the reduced motion. Then the
 volume balance of the fluid is fulfilled, and only the forces are out of balance. These forces cause the errors of
@@ -64,8 +64,8 @@ SOFTER = 2.0
 class _Body(NamedTuple):
     """Matrices (f, f) of the linear equations for the error, where f is the number of free degrees of freedom."""
 
-    relaxing: jax.Array  # stiffness of the stress that relaxes [N/m]; without viscosity: of the whole stress
-    rest: Any  # stiffness of springs and of the stress that does not relax [N/m]; None if there are no such parts
+    relaxing: jax.Array  # stiffness due to the stress that relaxes [N/m]; without viscosity: due to the whole stress
+    rest: Any  # stiffness due to springs and to stress that does not relax [N/m]; None if there is neither
     mass: Any  # diagonal of the mass matrix (f,) [kg]; None without inertia
 
 
@@ -94,8 +94,8 @@ def reduced_error(model: ReducedModel, scene: Scene, result: ReducedResult) -> R
 
 
 def _softening(scene: Scene, r: np.ndarray, x: jax.Array) -> float:
-    """Return the largest nodal displacement due to forces r (V, 3) [N] with the stiffness at positions x (V, 3) [m],
-    divided by the largest nodal displacement with the stiffness of the reference shape. Viscosity is not used. The
+    """Return a ratio: the largest nodal displacement that the forces r (V, 3) [N] cause with the stiffness at positions
+    x (V, 3) [m], divided by the same quantity for the stiffness of the reference shape. Viscosity is not used. The
     ratio is infinite if one of the two stiffness matrices is singular or not finite."""
     from scipy.sparse.linalg import splu
 
@@ -209,8 +209,8 @@ def _recursion(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the coefficients a, b, c (N,) [1] of the recursion gamma_new = a S + b gamma + c S_before for the history
     variables gamma of N Prony terms.
 
-    S is the stress at the end of the step, and S_before the stress at its beginning. The arrays are empty if the scene
-    has no viscosity.
+    S is the stress at the end of the step, and S_before the stress at the beginning of the step. The arrays are empty
+    if the scene has no viscosity.
     """
     if scene.viscosity is None:
         return np.zeros(0), np.zeros(0), np.zeros(0)

@@ -38,7 +38,7 @@ def save_reduced(model: ReducedModel, file: str | Path, scene_text: str = "") ->
     with whole(Path(file)) as new, h5py.File(new, "w") as out:
         for name, unit in _UNITS.items():
             array = np.asarray(getattr(model, name))
-            # In the file, the first axis of `modes` and of `slopes` is the number of the mode.
+            # In the file, the first axis of `modes` and of `slopes` counts the modes.
             out[name] = np.moveaxis(array, -1, 0) if name == "slopes" else array
             out[name].attrs["unit"] = unit
         if model.correction is not None:

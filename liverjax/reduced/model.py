@@ -38,9 +38,9 @@ from liverjax.simulation import automatic
 from liverjax.tensors.matrices import Matrix, deformation_gradient
 from liverjax.tensors.places import taken
 
-#: A parameter may be outside of its training range by this fraction of the width of the range. In a test with a viscous
-#: block, the stated error was half of the true error at this distance outside of the range. At a distance of half of
-#: the width, the stated error was a sixth of the true error.
+#: A parameter may be outside of its training range by at most this fraction of the width of the range. In a test with a
+#: viscous block, the stated error was half of the true error at this distance outside of the range. At a distance of
+#: half of the width, the stated error was a sixth of the true error.
 BEYOND = 0.1
 #: Entries of a scene that contain numbers on which the motion depends.
 _PARTS = ("law", "region", "viscosity", "porosity", "body", "displaced", "traction", "physics")
@@ -264,7 +264,8 @@ def other_numbers(scene: Scene, varied: Mapping[str, np.ndarray | jax.Array]) ->
 
 
 def _is_sequence(value: object) -> bool:
-    """Return whether a value is a tuple or a list of numbers. It has the same digest as an array of these numbers."""
+    """Return whether a value is a tuple or a list of numbers. Such a value has the same digest as an array of these
+    numbers."""
     if not isinstance(value, tuple | list) or not value:
         return False
     numbers = (int, float, np.generic, np.ndarray, jax.Array)
@@ -279,8 +280,8 @@ def _course(scene: Scene) -> Content:
 
 
 def loads_of_run(scene: Scene) -> dict[str, np.ndarray]:
-    """Return the lowest and the highest values (2, …) of each load and prescribed motion in a run, by name, with their
-    histories. The value 0 is always included, because a run begins at rest.
+    """Return the lowest and the highest values (2, …) of each load and prescribed motion in a run, by name. If a load
+    has a history, the values of this history are used. The value 0 is always included, because a run begins at rest.
 
     The values are those at the beginning and at the ends of the steps. They must be known (not inside jit, grad or
     vmap).
@@ -319,9 +320,9 @@ def _is_outside(value: np.ndarray, bounds: np.ndarray | jax.Array) -> bool:
 
 
 def parameters_outside(model: ReducedModel, scene: Scene) -> list[str]:
-    """Return the names of the parameters that are outside their training range by more than `BEYOND` of its width, or
-    that the scene does not have. Then follow loads and motions whose values during the run (`loads_of_run`) are outside
-    their training range. The values must be known (not inside jit, grad or vmap)."""
+    """Return the names of parameters, and of loads and motions during the run (`loads_of_run`), if their values are
+    outside the training range by more than `BEYOND` times the width of this range. Parameters that the scene does not
+    have are also listed. The values must be known (not inside jit, grad or vmap)."""
     found = []
     for name, bounds in model.ranges.items():
         value = _known_value(scene, name)

@@ -76,7 +76,7 @@ class _Given(NamedTuple):
     """Reduced loads and prescribed motion at the end of each of T steps, for n modes and S points."""
 
     load: jax.Array  # forces on the modes (T, n) [N m^-1.5]
-    gradient: jax.Array  # deformation gradient of the prescribed motion (T, 9, S), or (1, 9, S) without motion
+    gradient: jax.Array  # deformation gradients (T, 9, S) of the prescribed motion; (1, 9, S) without such motion
 
 
 def _given(model: ReducedModel, scene: Scene) -> tuple[_Given, jax.Array]:
@@ -281,9 +281,9 @@ def stated_error(model: ReducedModel, scene: Scene, result: ReducedResult, corre
     maximum over all steps up to this step.
 
     Unlike `reduced_error`, this function does not solve equations on the full mesh, and it may be used inside jit, grad
-    and vmap. The error of the corrected motion is learnt from training runs, by cross-validation. The uncorrected
-    motion is less accurate. Its error is estimated well by the size of the correction. `experiments/TABLES.md` compares
-    the two estimates.
+    and vmap. The error of the corrected motion is learnt from training runs, by cross-validation. The error of the
+    uncorrected motion is larger. It is estimated by the size of the correction. `experiments/TABLES.md` compares the
+    two estimates.
 
     Args:
         model, scene, result: arguments and result of `simulate_reduced`.

@@ -1,10 +1,12 @@
-"""Select a few integration points, with non-negative weights, that give the reduced forces of the training runs.
+"""Select a few integration points and their non-negative weights, so that they give the reduced forces of the training
+runs.
 
-The contributions of all P integration points to the reduced forces form a matrix G. It has one row for each reduced
-force in each training state, and the sum of a row is this force. The rows of G are replaced by the most important
-singular vectors of G. Then the factors xi >= 0 of the points are the least-squares solution of G xi = G 1, where 1 is
-the vector of ones (method of Lawson and Hanson). One more equation preserves the total volume. The number of positive
-factors is at most the number of equations (Hernandez, Caicedo, Ferrer 2017).
+The contributions of all P integration points to the reduced forces form a matrix G. G has one row for each reduced
+force in each training state. The sum of the entries in a row is the reduced force. The rows of G are replaced by the
+right singular vectors of G that have the largest singular values. Then the factors xi >= 0 of the points are the
+least-squares solution of G xi = G 1, where 1 is the vector of ones (method of Lawson and Hanson). One more equation
+preserves the total volume. The number of positive factors is at most the number of equations (Hernandez, Caicedo,
+Ferrer 2017).
 """
 
 from collections.abc import Callable, Mapping
@@ -58,8 +60,8 @@ def sampled(
     these points.
 
     The size of a state is the norm of the motions that its forces cause, or the norm of its coordinates if this is
-    larger. The rows of G are divided by this size. States at rest are not used. States with an inverted element are not
-    used if the law has no finite stress there.
+    larger. Each row of G is divided by the size of its state. States at rest are not used. States with an inverted
+    element are not used if the law has no finite stress there.
 
     Args:
         whole: model with all points, from `with_all_points`.
@@ -76,8 +78,8 @@ def sampled(
         forces, volumes = _contributions(whole, own, (jnp.asarray(q[r]), p), jnp.asarray(times))
         # Forces are converted to motions, because forces on stiff modes are large but cause little motion.
         G = compliance @ np.asarray(forces)
-        # If no load acts (prescribed displacements), the forces of the points cancel, and only the coordinates show the
-        # size of the motion.
+        # If only prescribed displacements act, the forces of the points cancel. Then only the coordinates show the size
+        # of the motion.
         size = np.maximum(np.linalg.norm(G.sum(axis=2), axis=1), np.linalg.norm(np.asarray(q[r])[times], axis=1))
         # States are not used if some stress is not finite (inverted elements) or if the body is at rest.
         good = np.isfinite(G).all(axis=(1, 2)) & (size > LEAST_MOTION * np.abs(q).max())
@@ -90,8 +92,8 @@ def sampled(
 
 
 def _balances(volumes: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Return rows (2 K m, P) of the matrix G, from both sides `volumes` (2, K, m, P) [Pa m^1.5] of the fluid's volume
-    balance (see `_balance`), for K states, m pressure modes and P points.
+    """Return the rows (2 K m, P) of the matrix G for the fluid's volume balance, with K states, m pressure modes and P
+    points. `volumes` (2, K, m, P) [Pa m^1.5] contains both sides of the balance (see `_balance`).
 
     Each row is divided by the scale of its state. The scale is the norm of the pressures due to the change of volume,
     plus the norm of the pressure coordinates p (K, m) [Pa m^1.5].
@@ -111,7 +113,8 @@ def _at(whole: ReducedModel, points: np.ndarray, weights: jax.Array) -> ReducedM
 
 
 def states_of(runs: int, steps: int) -> list[tuple[int, np.ndarray]]:
-    """Return a list of (number of a run, numbers of its steps). The forces of these training states are used.
+    """Choose the training states whose forces are used. Return a list of (number of a run, numbers of the chosen steps
+    of this run).
 
     The chosen steps of a run are evenly spaced, and the first chosen step differs from run to run. So all times occur,
     even if only few steps of each run are used. The first steps of the runs alone would contain no large motion.

@@ -59,8 +59,8 @@ def separate(
     most_terms: int = 50,
     checks: int = 8,
 ) -> SeparatedModel:
-    """Compute the displacement of a static scene as a sum of products, and the error of this sum in runs that are not
-    on the grid.
+    """Compute the displacement of a static scene as a sum of products, and the error of this sum for parameters that
+    are not grid points.
 
     Args:
         scene: `Scene` without time. The displacement at the last load step is used.
@@ -75,7 +75,7 @@ def separate(
             converge, or no run of the grid moves the body.
     """
     names, limits = _names_and_limits(scene, ranges, points)
-    t = np.cos(np.pi * (np.arange(points) + 0.5) / points)  # Chebyshev's points in (-1, 1)
+    t = np.cos(np.pi * (np.arange(points) + 0.5) / points)  # Chebyshev points in (-1, 1)
     axes = [low + (high - low) * 0.5 * (1 + t) for low, high in limits]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(names))
     between = limits[:, 0] + np.random.default_rng(0).random((checks, len(names))) * np.ptp(limits, axis=1)
@@ -104,8 +104,8 @@ def separate(
 def separated_displacement(model: SeparatedModel, values: Mapping[str, Any]) -> jax.Array:
     """Return the displacements (V, 3) [m] of the model. `values`: dotted name of each parameter -> one value.
 
-    The function may be used inside jit, grad and vmap. There, a value outside of the model's range gives NaN for the
-    displacements and their derivatives.
+    The function may be used inside jit, grad and vmap. In these transformations, a value outside of the model's range
+    gives NaN for the displacements and their derivatives.
 
     Raises:
         InputError: a parameter has no value, a name is not a parameter of the model, or a value is outside of the
@@ -193,8 +193,7 @@ def _terms(
         shape: shape of the grid.
         tolerance, most: `tolerance` and `most_terms` of `separate`.
     """
-    # The displacements of the N runs are written in a basis of the space that they span. So each run has at most N
-    # coordinates.
+    # The displacements of the N runs are expressed in a basis of their span, so each run has at most N coordinates.
     U, S, _ = np.linalg.svd(known, full_matrices=False)
     data = U * S
     size, left = np.linalg.norm(data), data
@@ -213,8 +212,8 @@ def _terms(
 
 
 def _rank_one(tensor: np.ndarray) -> list[np.ndarray]:
-    """Find the product of vectors, one for each axis, that is closest to a tensor. Return the unit vectors of all
-    axes except the last."""
+    """Find the rank-one tensor that is closest to a given tensor. A rank-one tensor is a product of one vector for each
+    axis. Return the unit vectors of all axes except the last."""
     n = tensor.ndim
     # For each axis, the tensor is unfolded to a matrix with one row per index of this axis. The iteration begins with
     # the first left singular vectors of these matrices.

@@ -39,7 +39,7 @@ class ReducedMotion(NamedTuple):
     velocity: jax.Array  # (n,) [m^2.5/s]
     acceleration: jax.Array  # (n,) [m^2.5/s^2]
     change: jax.Array  # change of the acceleration in the last step (n,) [m^2.5/s^2]
-    steady: jax.Array  # whether `change` is closer to the change in the step before than to 0
+    steady: jax.Array  # whether `change` is closer to the `change` of the previous step than to 0
 
 
 class ReducedEquations(NamedTuple):
@@ -188,7 +188,7 @@ class _ReducedIterate(NamedTuple):
     internal: jax.Array  # forces of P on the modes (n,) [N m^-1.5]
     r: jax.Array  # out-of-balance forces (n,) [N m^-1.5]
     size: jax.Array  # norm of r, relative to the size of all forces
-    rounded: jax.Array  # bound of the error of `size` due to single precision
+    rounded: jax.Array  # upper bound of the error of `size` due to single precision
     inverse: jax.Array  # exact or approximate inverse of the tangent (n, n) [m^4/N]
     fresh: jax.Array  # whether `inverse` is the inverse of the tangent at q
     slow: jax.Array  # whether the last iteration reduced the residual too little
@@ -220,7 +220,8 @@ def _updated(inverse: jax.Array, moved: jax.Array, change: jax.Array) -> jax.Arr
 
 
 def _in_double_precision(e: ReducedEquations, at: _ReducedIterate) -> _ReducedIterate:
-    """Return the same iterate, with forces computed in double precision from its deformation gradients."""
+    """Return the same iterate, with forces computed in double precision from the deformation gradients of this
+    iterate."""
     P = _point_forces(e, at.F)
     internal = _added_up(e, P)
     r, size = _relative_residual(e, at.q, P, internal)
@@ -257,7 +258,7 @@ def _corrected(e: ReducedEquations, at: _ReducedIterate) -> _ReducedIterate:
     more = jnp.tensordot(change.astype(jnp.float32), e.light.slopes, axes=2).astype(dq.dtype)
     internal = at.internal + more
     r, size = _relative_residual(e, q, P, internal)
-    # Bound of the roundoff in r due to the matrix products, relative to the size of all forces.
+    # Upper bound of the roundoff of the matrix products in r, relative to the size of all forces.
     lost = float(jnp.finfo(jnp.float32).eps) * e.steepest * jnp.linalg.norm(change) * size
     rounded = at.rounded + lost / jnp.maximum(jnp.linalg.norm(r), jnp.finfo(r.dtype).tiny)
     inverse = _updated(at.inverse, -part * dq, r - at.r)
@@ -317,9 +318,9 @@ def _solved(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, in
 
     start = e.q if e.motion is None else e.q + e.dt * e.motion.velocity
     if e.motion is not None and not newmark:
-        # The coordinates are predicted by a parabola or a cubic through the last coordinates: by the curve that would
-        # have predicted the last step better. The accelerations of Newmark's method oscillate, so there the prediction
-        # uses only the velocity.
+        # A parabola or a cubic through the last coordinates predicts the next coordinates. The curve that would have
+        # predicted the last step better is used. The accelerations of Newmark's method oscillate, so the prediction for
+        # this method uses only the velocity.
         more = jnp.where(e.motion.steady, e.motion.change, 0.0)
         start = start + e.dt**2 * (e.motion.acceleration + more)
     foretold, none = gradients_at(e, start), jnp.zeros((), jnp.int32)
@@ -334,7 +335,7 @@ def _solved(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, in
     begin = begin._replace(iterations=at.iterations)
     at = jax.tree.map(lambda old, new: jnp.where(at.size > tolerance, new, old), at, begin)
     at = jax.lax.while_loop(unfinished, lambda at: inner(refreshed(at)), at)
-    # The coordinates q are corrected once more, because this needs no new forces.
+    # The coordinates q are corrected once more. This correction needs no new forces.
     return _Found(at.q - at.inverse @ at.r, at.size, at.iterations, at.inverse)
 
 

@@ -57,10 +57,11 @@ def reduce_scene(
         most_modes: maximum number of modes.
         point_tolerance: the reduced forces are converted to motions; the sampled points may neglect this fraction of
             the motions [1]. Default: `tolerance`.
-        runs: number of full runs. Two thirds of them use the first rows. A preliminary reduced model is made from these
-            two thirds. The last third uses the remaining rows with the largest corrections of this model, relative to
-            the displacements (if the model has no correction: the largest displacements). If none of the last third
-            converges, the result is the preliminary model. Default: all rows.
+        runs: number of full runs. Default: all rows. If there are more rows than runs, two thirds of the runs use the
+            first rows. A preliminary reduced model is made from these two thirds. The last third uses the remaining
+            rows with the largest corrections of the preliminary model, relative to the displacements. If this model has
+            no correction, the last third uses the rows with the largest displacements. If none of the last third
+            converges, the result is the preliminary model.
 
     Raises:
         InputError: the scene has entries that reduced models do not support; a tolerance is not between 0 and 1; no run
@@ -128,7 +129,7 @@ def _words_of(row: Mapping[str, np.ndarray]) -> str:
 
 
 def _full_runs(scene: Scene, values: dict[str, np.ndarray]) -> _Runs:
-    """Return the runs that converged, and warn of the others."""
+    """Return the runs that converged, and warn of the runs that failed."""
     result = simulate_batch(scene, dict(values)).result
     good = np.all(np.asarray(result.status) == status.CONVERGED, axis=1)
     if not good.all():
@@ -201,8 +202,8 @@ def _coordinates_of_rows(
 
 def _errors_of_rows(model: ReducedModel, scene: Scene, values: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return for each row the largest correction of a node, divided by the largest displacement [1]. If the model has
-    no correction, return the largest displacement [m] instead. The value of a run at rest is 0, and that of a failed
-    run is -1."""
+    no correction, return the largest displacement [m] instead. The value of a run at rest is 0, and the value of a
+    failed run is -1."""
     q, failed = _coordinates_of_rows(model, scene, values)
     found, moved = np.zeros(len(q)), np.zeros(len(q))
     for k, own in enumerate(q):
@@ -218,10 +219,9 @@ def _errors_of_rows(model: ReducedModel, scene: Scene, values: Mapping[str, np.n
 
 
 def proper_modes(u: np.ndarray, volumes: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return n modes (n, V, c). Linear combinations of these modes approximate the N fields u (N, V, c), which have c
-    components, with a relative error of at most `tolerance`.
-
-    The error is a root mean square with the weights `volumes` (V,), the volumes of the nodes.
+    """Return n modes (n, V, c). Linear combinations of these modes approximate the N fields u (N, V, c) with c
+    components. The relative error is at most `tolerance`. The error is a root mean square, weighted by the nodal
+    volumes `volumes` (V,).
     """
     modes = principal_fields((u * np.sqrt(volumes)[:, None]).reshape(len(u), -1), tolerance)
     return modes.reshape(-1, *u.shape[1:]) / np.sqrt(volumes)[:, None]

@@ -2,7 +2,7 @@
 
 "auto" chooses a factorisation for a static body of at most 10,000 tetrahedra (a quadratic element counts as eight) in
 two cases. In the first case the bulk modulus is more than a thousand times the shear modulus. For a body of at most
-1,500 tetrahedra, a ratio above a hundred is enough: its stiffness can have negative eigenvalues during Newton's method,
+1,500 tetrahedra, a ratio above a hundred is enough: during Newton's method the stiffness can have negative eigenvalues,
 and conjugate gradients cannot solve such systems. In the second case an element is a sliver (quality below 0.001).
 "auto" never chooses a factorisation if the body has friction, nodes that move together, follower pressures, or
 pressures as unknowns. In all other cases "auto" chooses conjugate gradients. The limits come from tests in
@@ -77,7 +77,8 @@ def linear_solver(scene: Scene) -> str:
 
 
 def _may_factorise(scene: Scene) -> bool:
-    """Return whether the number of elements and the physics allow a factorisation, for any moduli and shapes."""
+    """Return whether the number of elements and the physics allow a factorisation. Moduli and element shapes are
+    ignored."""
     solve = scene.solve
     if solve.volumetric == "mixed" or any(physics.ties for physics in scene.physics):
         return False
@@ -97,7 +98,7 @@ def _is_stiff(scene: Scene) -> bool:
     try:
         shear = scene.law.shear_modulus()
         bulk = scene.law.bulk_modulus() if scene.porosity is None else scene.porosity.limit_bulk
-    except InputError:  # a law may have no moduli: then this ratio is unknown
+    except InputError:  # the ratio is unknown, because the law has no moduli
         return False
     if isinstance(shear, jax.core.Tracer) or isinstance(bulk, jax.core.Tracer):
         return False

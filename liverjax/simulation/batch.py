@@ -26,7 +26,8 @@ STRATEGIES = ("map", "vmap")
 
 @struct
 class Batch:
-    """Results of N runs of T steps. `result.status` has the shape (N, T). A failed run does not affect other runs."""
+    """Results of N runs with T steps each. `result.status` has the shape (N, T). A failed run does not affect other
+    runs."""
 
     result: Result = param("1", "every field with a leading axis of N runs")
     reference: jax.Array | None = param(
@@ -113,8 +114,8 @@ def _lanes(parameters: dict[str, jax.Array]) -> int:
     return int(lengths[first] or 0)
 
 
-#: If the parameters change only numbers of these tables, the sets after the first one are checked only for bounds and
-#: for numbers that exclude each other, for example times that do not increase.
+#: If all parameters belong to these tables, only the first parameter set gets all checks. In the other sets, only the
+#: bounds of numbers and contradictions between numbers are checked, for example times that do not increase.
 _MATERIAL = ("law", "viscosity", "porosity", "body", "region", "traction", "solve")
 
 

@@ -25,8 +25,8 @@ from liverjax.solvers.block_matrix import columns, flat
 from liverjax.solvers.step_cutting import ROUNDINGS
 from liverjax.tensors.matrices import Matrix, add_matrices, deformation_gradient, determinant
 
-#: If no load acts, and the sum of all force norms is below this multiple of the effect of rounded positions on the
-#: material, the forces are only roundoff. In unloaded bodies this sum was between 0.2 and 0.6 times this effect.
+#: If no load acts, and the sum of all force norms is below this multiple of `Sizes.of_material`, the forces are only
+#: roundoff. In unloaded bodies this sum was between 0.2 and 0.6 times `of_material`.
 _ONLY_ROUNDOFF = 2.0
 
 
@@ -98,7 +98,7 @@ class Forces(NamedTuple):
     pressure: jax.Array | None  # (V,) [Pa] pressures at the nodes, or None
     x: jax.Array  # (V, 3) [m] positions
     F: Matrix  # deformation gradient
-    isochoric: jax.Array | None = None  # (V, 3) [N] part of `internal` without the stress of unknown pressures
+    isochoric: jax.Array | None = None  # (V, 3) [N] part of `internal` that pressure unknowns do not cause
 
     @property
     def total(self) -> jax.Array:
@@ -123,7 +123,7 @@ def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
         """Return the nodal forces at x without inertia. The initial acceleration follows from these forces."""
         if start is not None or (scene.porosity is not None and scene.porosity.initial_pressure is not None):
             return _forces_at_beginning(scene, x)
-        # At rest in the reference positions only nodal forces act.
+        # If the body is at rest in the reference positions, only nodal forces act.
         begin = _first_step(scene, x, free)
         acting = [p.freeze(None, begin) for p in physics if p.acts_without_memory()]
         forces = [a.force(scene.mesh, x, 0.0) for a in acting if isinstance(a, NodalForce) and not a.at_end]
@@ -226,7 +226,7 @@ def _roundoff_at_nodes(scene: Scene, rounded: jax.Array) -> jax.Array:
 
 
 def _is_spring(acting: NodalForce) -> bool:
-    """Return whether the class of `acting` defines a stiffness, so that its force changes with the positions."""
+    """Return whether the class of `acting` defines a stiffness. Then the force changes with the positions."""
     own = type(acting)
     return own.stiffness is not NodalForce.stiffness or own.attached is not NodalForce.attached
 
@@ -247,8 +247,8 @@ def _of_physics(scene: Scene, physics: tuple[Physics, ...], state: State, k: Num
     if scene.solve.volumetric == "mixed":
         # With volumetric = "mixed", inertia forces enter the sum of the force norms only with a weight of about shear
         # modulus / bulk modulus (`Mixed.counted`). In short time steps the roundoff of inertia forces exceeds the
-        # tolerance that follows from this sum, so this roundoff is added. In single precision, too, the roundoff of
-        # double precision is added. So a single-precision run that stops at a larger residual is reported.
+        # tolerance that follows from this sum, so this roundoff is added. A run in single precision gets the same term
+        # as a run in double precision. So if its residual stops at a larger value, this is reported.
         noise = noise + ROUNDINGS * sizes.roundoff * (eps / float(jnp.finfo(state.x.dtype).eps))
     moved, farther = _prescribed_motion(scene, k), jnp.ones((), state.x.dtype)
     if moved is not None:  # far from the reference shape the coordinates are larger, so their roundoff is larger too
@@ -318,7 +318,7 @@ def unknowns(e: Equations, x: jax.Array, pressure: jax.Array | None = None) -> j
 def in_directions_at(
     e: Equations, x: jax.Array | None, make: Callable[[Equations], Callable[[jax.Array], jax.Array]]
 ) -> Callable[[jax.Array], jax.Array]:
-    """Return the function of flat vectors (3 V,) that `make` returns, if necessary with a change of directions.
+    """Return the function that `make` returns, with a change of directions if necessary. It maps flat vectors (3 V,).
 
     Nodes that rotate together move along circles, so the directions of their motions change during a step. Flat vectors
     use the directions at the beginning of the step. The function from `make` uses the directions at positions x (V, 3),
@@ -366,7 +366,8 @@ def forces(
 
 
 def forces_at(scene: Scene, x: jax.Array) -> jax.Array:
-    """Return the external forces (V, 3) [N] that would hold the nodes at x (V, 3), in a scene without supports."""
+    """Return the external forces (V, 3) [N] that hold the nodes at the positions x (V, 3), in a scene without
+    supports."""
     none = jnp.zeros(())
     e = equations(scene, initial_state(scene), 1.0, Sizes(none, none, none))
     q = unknowns(e, x)
@@ -417,10 +418,10 @@ def residual(
 ) -> tuple[jax.Array, jax.Array, jax.Array | None]:
     """Return out-of-balance forces (3 V,) [N] at fraction s of the step, the sum of all force norms, and the pressures.
 
-    The sum [N] also contains `e.noise`. If the forces are only roundoff, the sum is so large that the iterations
-    converge: a body without loads has reached equilibrium, also in single precision. If pressures are unknowns, the
-    residual of the pressure equation, times `e.mixed.unit` [N], follows the forces. In the sum, the weight of the
-    isochoric forces is then 1, and the weight of the other forces is about the shear modulus divided by the bulk
+    The sum [N] also contains `e.noise`. If the forces are only roundoff, `e.noise` and a further term make the sum so
+    large that the iterations end: a body without loads is in equilibrium, also in single precision. If pressures are
+    unknowns, the residual of the pressure equation, times `e.mixed.unit` [N], is appended to the forces. The sum then
+    contains the isochoric forces with weight 1, and the other forces with a weight of about shear modulus / bulk
     modulus (see `Mixed.counted`).
     """
     f = forces(e, q, s, guess)
@@ -442,7 +443,7 @@ def residual(
 def energy(e: Equations, q: jax.Array, start: jax.Array) -> jax.Array:
     """Return the energy [J] of a step for the unknowns q: the sum of the incremental potentials of all force terms.
 
-    At `start` the gradient of the energy is the residual. If all forces have an energy, this is true at every q.
+    At `start` the gradient of the energy is the residual. If all forces have an energy, this holds at every q.
     """
     x, begin = positions(e, q, 1.0), positions(e, start, 1.0)
     F = deformation_gradient(e.mesh, x)

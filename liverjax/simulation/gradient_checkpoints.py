@@ -1,7 +1,7 @@
 """Checkpoints of reverse-mode differentiation: the states and roots of all steps are kept, or only a few states.
 
-The root of a step is the solution of its equations (`liverjax.solvers.step_cutting` sets its name for JAX). Since the
-root is kept, the derivative evaluates forces and tangent at the root again, but does not repeat Newton's iterations. If
+The root of a step is the solution of its equations (`liverjax.solvers.step_cutting` sets its name for JAX). The root is
+kept. So the derivative evaluates forces and tangent at the root again, but does not repeat Newton's iterations. If
 fewer states than steps are kept (Griewank and Walther 2008, chapter 12), the steps between two kept states run a second
 time.
 """
@@ -36,7 +36,7 @@ def number_kept(store: str | int, steps: int) -> int:
 
 
 def lengths(steps: int, kept: int) -> tuple[int, int, int]:
-    """Return the number of full segments, of steps per segment, and of steps in a shorter last segment (or 0)."""
+    """Return the number of full segments, the steps per segment, and the steps of a shorter last segment (0: none)."""
     length = math.ceil(steps / kept)
     return steps // length, length, steps % length
 
@@ -63,8 +63,8 @@ def scan(step: Callable, start: Any, numbers: jax.Array, kept: int) -> Any:
         nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(step, carry, k)[1])
         return jax.lax.cond(real, step, lambda carry, _: (carry, nothing), carry, k)
 
-    # Only the state at the beginning of a segment is kept. All segments share one compiled loop of equal length, so the
-    # last segment skips the steps after the end of the run.
+    # Only the state at the beginning of a segment is kept. All segments use the same compiled loop with equal length,
+    # so the last segment skips the steps after the end of the run.
     @jax.checkpoint
     def segment(carry, at):
         return jax.lax.scan(unless_over, carry, at) if beyond else jax.lax.scan(step, carry, at)

@@ -98,8 +98,8 @@ def _program_of_gradient(loss: Callable[[Result], jax.Array], store: str | int, 
     return jax.jit(both)
 
 
-#: Memory for the derivative of one step, without the tangents: the number of floating-point numbers that are stored for
-#: each integration point (measured).
+#: Number of floating-point numbers per integration point that the derivative of one step stores, without the tangents
+#: (measured).
 _WORK = 440
 
 
@@ -130,9 +130,9 @@ def memory(scene: Scene, store: str | int = "all") -> int:
     if kept < steps:
         count, length, rest = gradient_checkpoints.lengths(steps, kept)
         stored, again = (count + (rest > 0)) * (state + tangent), length * (state + root)
-    # There are two tangents: the tangent of a step, and the tangent of the beginning of the run. The run holds three
-    # arrays like the positions for each step, and the fluid pressures. The way back holds only the derivatives with
-    # respect to the positions, and the work of one step.
+    # There are two tangents: the tangent of a step, and the tangent of the beginning of the run. For each step, the
+    # forward run stores three arrays with the size of the positions, and the fluid pressures. The reverse run stores
+    # the derivatives with respect to the positions, and needs the working memory of one step.
     forward = stored + steps * (3 * positions + others) + 2 * tangent
     work = _WORK * scene.mesh.weights.size * scene.mesh.points.dtype.itemsize
     return max(forward, stored + again + steps * positions + 2 * tangent + work)

@@ -18,10 +18,10 @@ The pressures of a fluid are linear both in linear and in quadratic elements. Wi
 has the same elements on a finer mesh: every element is cut into eight (`liverjax.scenes.refined`). Then du is
 multiplied by 4/3, because an error of second order is a quarter as large on the finer mesh.
 
-In dynamics the errors of the steps accumulate. The richer run has consistent masses, so that the added functions have
-the same acceleration under gravity as the other functions. The inertia forces follow from the accelerations of the
-richer run. Each step is linearised at the positions of the richer run before the step, plus the displacement of the
-first run in this step.
+In dynamics the errors of the steps accumulate. The second run (richer run) has consistent masses, so that the added
+functions have the same acceleration under gravity as the other functions. The inertia forces follow from the
+accelerations of the richer run. Each step is linearised at the positions of the richer run before the step, plus the
+displacement of the first run in this step.
 """
 
 import warnings
@@ -67,8 +67,8 @@ from liverjax.solvers.problem import MOST_LINEAR_ITERATIONS
 #: Relative tolerance of the linear solve. With a tolerance of 1e-1, the estimate for a slender beam of quadratic
 #: elements would be only a fifth of the true error.
 _TOLERANCE = 1e-2
-#: The keys are the order of the elements. _WITH_PRESSURES: tolerance of the linear solve if pressures are unknowns.
-#: _FACTOR: factor that multiplies du.
+#: Key: order of the elements. _WITH_PRESSURES: tolerance of the linear solve if pressures are unknowns. _FACTOR: factor
+#: that multiplies du.
 _WITH_PRESSURES = {1: 1e-5, 2: 1e-4}
 _FACTOR = {1: 1.0, 2: 1.5}
 #: Error bar of a quantity, divided by the estimated change of this quantity.
@@ -82,7 +82,7 @@ _ROUNDS, _SETTLED = 24, 1e-3
 #: With a flowing fluid, the solves end if the relative residual (as for `_SETTLED`) is below this value. One solve is
 #: not exact, because it only approximates the inverse of the pressure matrix (`liverjax.physics.darcy.nearly_solved`).
 _WITH_FLUID = 1e-5
-#: If the change from a repeated solve does not reduce the residual, the change is halved, at most this number of times.
+#: If the change dq from a repeated solve does not reduce the residual, dq is halved, at most this number of times.
 _HALVINGS = 4
 
 
@@ -113,7 +113,7 @@ class MeshError:
         """
         if not isinstance(self.found, jax.core.Tracer) and not np.all(self.found):
             found = np.asarray(self.found)
-            steps = 1 + np.flatnonzero(~found.reshape(-1, found.shape[-1]).all(axis=0))  # of any member of a batch
+            steps = 1 + np.flatnonzero(~found.reshape(-1, found.shape[-1]).all(axis=0))  # failed steps, in any run
             warnings.warn(
                 f"the mesh error is not reliable in {len(steps)} of {found.shape[-1]} steps (the first is step "
                 f"{steps[0]}), because its solves did not converge or it inverts elements: use a finer mesh",
@@ -203,8 +203,8 @@ def richer(scene: Scene) -> Richer:
 def _with_richer_elements(scene: Scene) -> Scene:
     rich = enriched(scene)
     # Linear elements lock (are too stiff), so they are compared with elements that do not lock. If the bulk modulus is
-    # low, quadratic elements without pressure unknowns do not lock. They are preferred, because nodal pressures would
-    # be continuous even where the material changes.
+    # low, quadratic elements do not lock even without pressure unknowns. Then pressure unknowns are not used, because
+    # nodal pressures would be continuous even where the material changes.
     of_linear = "auto" if _may_lock(scene) else "element"
     volumetric = of_linear if scene.mesh.order == 1 else scene.solve.volumetric
     # Under an indenter, iterative solves for cubic elements with pressure unknowns do not converge, so the choice
@@ -240,8 +240,8 @@ def _may_lock(scene: Scene) -> bool:
 def refuse(scene: Scene) -> None:
     """Check that the mesh error of a scene can be estimated.
 
-    With a loaded mesh, the mesh also changes the reference shape. At the end of a static run both errors cancel, but
-    the estimate contains only the error of the run.
+    If the mesh is loaded, the reference shape also has a mesh error. At the end of a static run this error and the
+    error of the run cancel, but the estimate contains only the error of the run.
 
     Raises:
         InputError: the mesh is loaded, or the scene uses the one-step scheme.
@@ -309,7 +309,7 @@ _Solved = tuple[jax.Array, jax.Array, jax.Array]
 
 
 def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _Solved]:
-    """Return the unknowns at which the equations were linearised last, and the solution of this linear system.
+    """Return the unknowns of the last linearisation, and the solution of the linear system at these unknowns.
 
     Without contact and without a flowing fluid, there is one solve, at q. With contact, more solves are needed to find
     the contact points in the richer space. With a flowing fluid, more solves are needed because one solve is not exact.
@@ -347,7 +347,7 @@ def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _S
 
     def again(c: tuple) -> tuple:
         q, (dq, _, _), k = c
-        # In the first round dq is still 0.
+        # Before the first solve, dq is 0.
         q = q + jax.lax.cond(k == 0, lambda: one, lambda: _shortened(size, q, dq)) * dq
         return q, solved(q), k + 1
 
@@ -357,7 +357,8 @@ def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _S
 
 
 def _shortened(size: Callable[[jax.Array], jax.Array], q: jax.Array, dq: jax.Array) -> jax.Array:
-    """Return the step length t: 1, halved until q + t dq has a smaller residual than q, at most `_HALVINGS` times."""
+    """Return the step length t. From 1 it is halved (at most `_HALVINGS` times) until q + t dq has a smaller residual
+    than q."""
     before = size(q)
 
     def go_on(t: jax.Array) -> jax.Array:

@@ -64,8 +64,8 @@ def coupled(
 def balances(
     mesh: TetMesh, A: block_matrix.BlockMatrix | PointMatrix, motion: Sequence[jax.Array]
 ) -> tuple[tuple[jax.Array, ...], jax.Array]:
-    """Return the effect of the displacement `motion` at constant pressures: forces [N], as columns (V,), and the change
-    (V,) of the volume balance."""
+    """Return two effects of the displacement `motion` at constant pressures: forces [N], as columns (V,), and the
+    change (V,) of the volume balance."""
     if isinstance(A, PointMatrix):
         return point_matrix.product(mesh, A, motion), -point_matrix.volume_changes(mesh, A, motion)
     *forces, balance = block_matrix.product(A, motion)
@@ -81,8 +81,8 @@ def pressure_change(
 ) -> jax.Array:
     """Return the change of the pressures (V,) that reduces the residual `balance` (V,) of the pressure equation to 0.
 
-    Without `flow` the pressure matrix is diagonal. With `flow` the pressure equation is solved approximately, or to its
-    tolerance if `exactly` is true.
+    Without `flow` the pressure matrix is diagonal. With `flow` the pressure equation is solved approximately, or to the
+    tolerance of `flow` if `exactly` is true.
     """
     if flow is None:
         if isinstance(A, PointMatrix):
@@ -136,7 +136,8 @@ def undrained_bulk(mesh: TetMesh, C: block_matrix.BlockMatrix, mask: Number) -> 
     """Return the stiffness [Pa/m^3] of each integration point against a volume change, if no fluid leaves an element.
 
     C is the pressure matrix. `mask` (V,) is 0 where the pressure is given, else 1. The diagonal of C is divided among
-    the elements in proportion to their volumes. The assembled matrix is then at least as stiff as the true matrix.
+    the elements in proportion to their volumes. With this division, the assembled matrix is at least as stiff as the
+    true matrix.
     """
     share = integrals(mesh, jnp.ones_like(mesh.volumes)) * mask / C.diagonal[0][0]
     return interpolated(mesh, share) / mesh.weights
@@ -146,7 +147,7 @@ def undrained_diagonal(A: block_matrix.BlockMatrix, mask: Number) -> block_matri
     """Return the diagonal blocks of K + G^T D^-1 G, with the diagonal D of the pressure matrix.
 
     K is the stiffness at given pressures, and G couples pressures and positions. `mask` (V,) is 0 where the pressure is
-    given, else 1. If nothing flows, the result is exact.
+    given, else 1. If nothing flows, these are exactly the diagonal blocks after the elimination of the pressures.
     """
     soft = -mask / A.diagonal[3][3]
     near = soft[A.nodes]

@@ -22,7 +22,8 @@ class ObstacleForces(NamedTuple):
 
 
 def obstacle_forces(scene: Scene, result: Result) -> ObstacleForces:
-    """Compute the forces on the obstacles of a scene, the depths of the surface in them, and their displacements.
+    """Compute three results for the obstacles of a scene: the forces on them, their displacements, and how deep the
+    body's surface lies in them.
 
     All three results are differentiable.
 
@@ -38,7 +39,7 @@ def obstacle_forces(scene: Scene, result: Result) -> ObstacleForces:
             f"the result has {len(result.positions)} steps, but the scene has {scene.solve.steps}: give the result of "
             "all steps"
         )
-    scene = prepared(scene)  # as in the run: one value per element, in the precision of the scene
+    scene = prepared(scene)  # as for the run: numbers per element, in the precision of the scene
     steps, dt = scene.solve.steps, 0.0 if scene.solve.dt is None else scene.solve.dt
     mesh, free = scene.mesh, Free(jnp.ones_like(scene.mesh.points))
     numbers = jnp.arange(1, len(result.positions) + 1)

@@ -75,9 +75,8 @@ def problem_of(e: Equations) -> Problem:
 
 
 def beginning(first: Equations, tangent_too: bool = False) -> tuple[Kept, tangent.Tangent | None]:
-    """Return an empty `Kept` for a run whose first step has the equations `first`, and a tangent.
-
-    The tangent is computed at the positions at the beginning of the run. It is None unless `tangent_too` is true.
+    """Return an empty `Kept` for a run, and a tangent. `first`: equations of the first step of the run. The tangent is
+    computed at the positions at the beginning of the run. It is None unless `tangent_too` is true.
     """
     method, q = problem_of(first), unknowns(first, first.state.x)
     kept = step_cutting.nothing_kept(method, q)
@@ -109,7 +108,7 @@ def _definite(
 
 
 def _rest(e: Equations) -> tuple[jax.Array, jax.Array]:
-    """Return the unknowns of the reference shape, and a flag. The flag is true if this is the first step and it begins
+    """Return the unknowns of the reference shape, and a flag. The flag is true in the first step, if this step begins
     at positions that differ from the reference shape."""
     points = e.mesh.points
     return unknowns(e, points), (e.k == 1) & jnp.any(e.free.vectors(e.state.x - points) != 0)
@@ -173,10 +172,11 @@ def adjoint(
 
     Return x, the right-hand side, and the norm of the residual divided by the norm of the right-hand side.
 
-    With a flowing fluid, x also contains the pressures of the fluid, and b contains forces and minus the balance of
-    volumes. The returned right-hand side (3 V,) is then what remains of b after the elimination of the pressures.
-    Without a flowing fluid, it is b. Iterations begin with a combination of `earlier` solves if this reduces the
-    residual. Follower loads are not allowed. On a CPU, the columns of a Jacobian are solved one after another.
+    With a flowing fluid, x also contains the pressures of the fluid, and b contains the forces and the negative volume
+    balance. The returned right-hand side (3 V,) is then what remains of b after the elimination of the pressures.
+    Without a flowing fluid, the returned right-hand side is b. Iterations begin with a combination of `earlier` solves
+    if this reduces the residual. Follower loads are not allowed. On a CPU, the columns of a Jacobian are solved one
+    after another.
     """
     if e.scene.solve.linear_solver == "direct":
         return _adjoint(e, K, b, (tolerance, max_iterations), earlier)
@@ -216,8 +216,8 @@ def _adjoint(
 
 
 #: For `_with_flow`: tolerances of the solves for displacements and for pressures, maximum number of refinements, and
-#: maximum number of successive refinements without a smaller residual. Far from the solution an inaccurate solve for
-#: pressures may increase the residual.
+#: maximum number of successive refinements that do not reduce the residual. Far from the solution an inaccurate solve
+#: for pressures may increase the residual.
 _INNER, _INNER_PRESSURE, _REFINEMENTS, _VAIN = 5e-2, 1e-2, 60, 3
 
 
@@ -234,7 +234,8 @@ def _with_flow(
     given = (flow.mask - 1) * b[n:]  # part of the solution: the entries where the pressure is given
 
     def left(x: jax.Array, P: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return the out-of-balance forces for x and P + dP, and dP, the change of P that balances the volumes."""
+        """Return the out-of-balance forces for x and P + dP. Also return dP, the change of P that balances the
+        volumes."""
         motion = e.free.columns(block_matrix.columns(x))
         force, balance = mixed_system.balances(e.mesh, K.matrix, motion)
         balance = balance - b[n:] - darcy.flow_product(flow, P)

@@ -1,11 +1,11 @@
-"""The tangent of the forces of a scene, computed from hand-derived stiffness blocks, and linear solves with it.
+"""The tangent of the forces of a scene (from hand-derived stiffness blocks), and linear solves with this tangent.
 
 With `linear_solver = "direct"` a factorisation solves the linear systems. Otherwise the physics of the scene determines
 the method. Conjugate gradients solve symmetric systems, after nodal pressures are eliminated. BiCGSTAB solves systems
-with follower loads or friction, because they are not symmetric. It also solves systems with pressures as unknowns,
-because their preconditioner is not symmetric. The preconditioner consists of the inverse diagonal blocks of the
-stiffness. A coarse space, with few unknowns for motions of long wavelength, is added if these motions would need many
-iterations. Columns (V,) are the x, y and z components of a nodal vector in separate arrays. A flat vector (3 V,)
+with follower loads or friction, because these systems are not symmetric. It also solves systems with pressure unknowns,
+because the preconditioner of these systems is not symmetric. The preconditioner consists of the inverse diagonal blocks
+of the stiffness. A coarse space, with few unknowns for motions of long wavelength, is added if these motions would need
+many iterations. Columns (V,) are the x, y and z components of a nodal vector in separate arrays. A flat vector (3 V,)
 contains the columns one after the other.
 """
 
@@ -47,13 +47,13 @@ _OWN = tuple((a, b) for a in range(3) for b in range(a, 3))
 #: book chapter, section 4.1.2 iii.
 KINDS = ("true", "projected", "regularised")
 
-#: One of `KINDS`; or one of the last two together with a flag that is computed at run time. If the flag is false, the
-#: true stiffness is used.
+#: One of `KINDS`; or a pair: one of the last two `KINDS`, and a flag that is computed at run time (false: true
+#: stiffness).
 Kind = str | tuple[str, jax.Array]
 
 
 def _of_kind(kind: Kind, make: Callable[[str], Any]) -> Any:
-    """Return `make(kind)`. If the kind is chosen at run time, the compiled program contains both kinds."""
+    """Return `make(kind)`. If the kind is chosen at run time, the compiled program contains code for both kinds."""
     if isinstance(kind, str):
         return make(kind)
     name, taken = kind
@@ -146,15 +146,15 @@ def volume_with_pressures(e: Equations) -> VolumeStress | None:
 
 
 class Tangent(NamedTuple):
-    """A tangent with its preconditioner. The tangent is assembled at some positions and used for iterates near them."""
+    """A tangent with its preconditioner, assembled at some positions and used for iterates near these positions."""
 
     matrix: BlockMatrix | PointMatrix
     inverse: Inverses  # inverses of the diagonal blocks of the matrix
-    vertices: Inverses | None  # for quadratic elements: `inverse` of linear elements with the same vertices
+    vertices: Inverses | None  # for quadratic elements: `inverse` for linear elements with the same vertices
     slow: Coarse
     x: jax.Array | None  # (V, 3) positions of the assembly; None: conservative forces, and no nodes rotate together
     s: Any  # fraction of the step at the assembly
-    follows: jax.Array | None  # 1 if K contains the tangent of non-conservative forces, else 0
+    follows: jax.Array | None  # 1 if K contains the stiffness of non-conservative forces, else 0
     attached: tuple[Between, ...] = ()  # stiffness between nodes that is not in the matrix
     pressures: Coarse | None = None  # coarse space of pressure unknowns in thin elements
     #: Whether `solve` eliminates pressure unknowns first; None: never.
@@ -197,10 +197,10 @@ def tangent(
 def eliminates_pressures(e: Equations) -> bool:
     """Return whether pressure unknowns are eliminated in solves with a tangent that has no negative eigenvalues.
 
-    Far from a solution, pressures and their stiffness are as large as the bulk modulus. Iterations for positions and
-    pressures together are scaled by the shear modulus and do not converge there. After the elimination the matrix of
-    the positions is positive definite. For linear elements the pressures are not eliminated, because the pressure
-    matrix has no simple inverse.
+    Far from a solution, the pressures, and the stiffness that they cause, are as large as the bulk modulus. Iterations
+    for positions and pressures together are scaled by the shear modulus and do not converge there. After the
+    elimination the matrix of the positions is positive definite. For linear elements the pressures are not eliminated,
+    because the pressure matrix has no simple inverse.
     """
     return e.mixed is not None and e.mesh.order > 1 and e.scene.solve.linear_solver != "direct"
 

@@ -34,7 +34,8 @@ from liverjax.solvers.block_matrix import columns, flat
 from liverjax.solvers.newton import NewtonOptions, newton_root
 from liverjax.solvers.step_cutting import ROUNDINGS
 
-#: A Newton step that does not reduce the residual is halved. Only the last linear solve needs high accuracy.
+#: `max_halvings`: a Newton step that does not reduce the residual is halved. `linear_tolerance`: it is large, because
+#: only the last linear solve needs high accuracy.
 _OPTIONS = NewtonOptions(max_iterations=50, linear_tolerance=1e-2, max_halvings=12, symmetric=False)
 #: After this number of relaxation times, the stress of an initially unrelaxed body is relaxed to within 1 %.
 _RESTS = 5.0
@@ -78,8 +79,8 @@ def unload(scene: Scene) -> Unloaded:
 def resting(scene: Scene) -> Scene:
     """Return a static scene of the same body, which has fully relaxed under the loads at time 0.
 
-    The form of the volume changes stays that of the given scene: without viscosity, `volumetric = "auto"` could choose
-    another form.
+    The setting `volumetric` of the given scene is kept: without viscosity, `volumetric = "auto"` could choose another
+    form.
     """
     form = automatic.form_of_volumes(scene)
     if scene.springpots is not None:
@@ -120,15 +121,17 @@ def _found_shape(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array, jax.Arr
 
     def held(z: jax.Array) -> jax.Array:
         e, q = _with_displacements(scene, given, z, sizes)
-        # Unknowns that are not free must be 0. Equations for this are added, so that the matrix has no empty rows.
+        # Unknowns that are not free must be 0. The added term gives equations for these unknowns, so that the matrix
+        # has no empty rows.
         return residual(e, q, one)[0] + (z - _free_part(first, z))
 
     options = _OPTIONS._replace(tolerance=jax.lax.stop_gradient(scene.solve.tolerance))
     z, found = newton_root(held, jnp.zeros_like(q), tangent.preconditioner(first, K), loads, options)
-    # `first` is constant. The free directions depend on the normal of a sliding support, so they are computed again.
+    # `first` is constant. The free directions depend on the normals of sliding supports, so they are computed again
+    # from `scene`.
     u = _displacements_in(equations(scene, initial_state(scene), one, sizes), z)
     mesh = with_points(scene.mesh, given - u)
-    # Loaded quadratic elements have curved edges, so their middles are not those of the given mesh.
+    # Loaded quadratic elements have curved edges, so their edge middles differ from the edge middles of the given mesh.
     good = jnp.all(volume_ratios(mesh, mesh.points + u) > 0) & jnp.all(mesh.volumes > 0)
     code = jnp.where((found.status == status.CONVERGED) & ~good, status.INVERTED, found.status)
     return mesh.points, code, found.residual, ROUNDINGS * first.roundoff / loads
@@ -146,8 +149,8 @@ def _displacements_in(e: Equations, z: jax.Array) -> jax.Array:
 
 
 def _with_displacements(scene: Scene, given: jax.Array, z: jax.Array, sizes: Sizes) -> tuple[Equations, jax.Array]:
-    """Return the equations of the body with the reference shape that follows from the unknowns z, and the unknowns of
-    the loaded body."""
+    """Return the equations of the body whose reference shape follows from the unknowns z, and the unknowns of the
+    loaded body."""
     still = equations(scene, initial_state(scene), jnp.ones((), given.dtype), sizes)
     mesh = with_points(scene.mesh, given - _displacements_in(still, z))
     one = replace(scene, mesh=mesh)

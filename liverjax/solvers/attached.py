@@ -27,7 +27,7 @@ class GivesWay(NamedTuple):
 
 
 class Masses(NamedTuple):
-    """Consistent minus lumped mass matrix of each element, or this difference times k/dt^2.
+    """Consistent mass matrix minus lumped mass matrix of each element, or this difference times k/dt^2.
 
     The difference times k/dt^2 is a term of the effective stiffness of a time step dt. The number k depends on the time
     integration (see `liverjax.physics.inertia`). n is the number of nodes of an element.
@@ -74,7 +74,7 @@ def product(A: Between, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
 
 def own_diagonal(A: Attached, number_of_nodes: int) -> Block:
     """Return the diagonal blocks of A at the nodes: 3 x 3 arrays (V,)."""
-    # If an element contains the same node twice, the block between its two entries is also on the diagonal.
+    # If a node occurs twice in an element, the block between both entries of the node is also on the diagonal.
     same = A.nodes[:, None] == A.nodes[None]
     own = jnp.sum(jnp.where(same[:, None, :, None], A.blocks, 0.0), axis=2)  # (n, 3, 3, m)
     own = jnp.zeros((number_of_nodes, 3, 3), own.dtype).at[A.nodes].add(jnp.transpose(own, (0, 3, 1, 2)))

@@ -9,8 +9,8 @@ from threadpoolctl import ThreadpoolController
 def one_blas_thread() -> AbstractContextManager:
     """Limit BLAS to one thread inside a `with` block, for code with several threads or with small matrices.
 
-    With more BLAS threads, the threads of BLAS and of this program would wait for each other. In tests, a factorisation
-    then took three times as long, and a step of a reduced model twice as long.
+    With more BLAS threads, the threads of BLAS and of this program would wait for each other. In tests with more BLAS
+    threads, a factorisation took three times as long, and a step of a reduced model twice as long.
     """
     return _libraries().limit(limits=1, user_api="blas")
 

@@ -1,7 +1,7 @@
 """Solve linear systems that are too ill-conditioned for Krylov methods, by sparse factorisation.
 
-The factorisation is SciPy's SuperLU. It runs on the CPU, outside the compiled program. Its time and memory grow faster
-than the number n of nodes (as n^1.5 to n^2), so it is suitable for bodies with a few thousand nodes.
+The factorisation is SciPy's SuperLU. It runs on the CPU, outside the compiled program. The required time and memory
+grow faster than the number n of nodes (as n^1.5 to n^2), so SuperLU is suitable for bodies with a few thousand nodes.
 """
 
 from collections.abc import Callable
@@ -77,7 +77,7 @@ def _filled(blocks: Block, like: jax.Array) -> jax.Array:
 
 def across(normals: np.ndarray, size: int) -> "scipy.sparse.csr_array":
     """Return the matrix (size, size) of the blocks n n^T of all nodes (unit normal n), in the order of the unknowns."""
-    import scipy.sparse  # its import takes a fifth of the package's import time, so it is imported only where needed
+    import scipy.sparse  # takes a fifth of the package's import time, so it is imported only where it is needed
 
     number, own = len(normals), np.arange(len(normals))
     entries = [
@@ -130,9 +130,8 @@ def _factorised_blocks(matrix: tuple) -> "_Factor":
 
 
 def _given_ways(attached: tuple[Between, ...], size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the vectors h (size, n) of the n rank-one changes `GivesWay`, and the stiffness of each (n,).
-
-    The rows of h are in the order of the unknowns.
+    """Return the matrix H (size, n) and the stiffnesses (n,) of n rank-one changes `GivesWay`. Each column of H is the
+    vector h of one change, in the order of the unknowns.
     """
     found = [own for own in attached if isinstance(own, GivesWay)]
     H = np.zeros((size, len(found)))
@@ -220,8 +219,8 @@ def _factorised(A: "scipy.sparse.csr_array", free: np.ndarray, along: tuple, way
 
 
 def _solution(own: _Factor, b: np.ndarray) -> np.ndarray:
-    """Return the solution x (n,) for the right-hand side b (n,). x is 0 at unknowns that are not free, and NaN at the
-    others if the matrix is singular."""
+    """Return the solution x (n,) for the right-hand side b (n,). x is 0 at unknowns that are not free. If the matrix is
+    singular, x is NaN at the free unknowns."""
     x, keep, (H, size) = np.zeros_like(b), own.keep, own.ways
     if own.factor is None:
         x[keep] = np.nan
@@ -242,7 +241,8 @@ _last: list[tuple[list[np.ndarray], object, _Factor]] = []
 
 
 def _kept_or_made(made: Callable[[tuple], _Factor], matrix: tuple) -> _Factor:
-    """Return the factor of a matrix. If it is the last matrix again, its factor is not computed again."""
+    """Return the factor of a matrix. If the matrix equals the last matrix, the factor of the last matrix is
+    returned."""
     leaves, structure = jax.tree.flatten(matrix)
     for before, own_structure, factor in _last[:1]:
         if structure == own_structure and all(map(_equal, before, leaves)):

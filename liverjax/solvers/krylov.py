@@ -193,11 +193,11 @@ def symmetric_solve(
     Args:
         matvec: function (x, earlier) -> (A x, the same earlier).
         both: b, and the earlier solves that give the starting vector.
-        solver: function (b, earlier) -> solution, right-hand side, and the true residual (its norm, divided by the norm
-            of the right-hand side). The right-hand side is b, or what remains of b after the elimination of unknowns.
+        solver: function (b, earlier) -> (solution, right-hand side, norm of the true residual divided by the norm of
+            the right-hand side). The right-hand side is b, or what remains of b after the elimination of unknowns.
         tolerance: tolerance of the solver.
     """
-    # All arrays are joined to one vector, because JAX raises an error if some of the arrays have no cotangents.
+    # All arrays are joined into one vector, because JAX raises an error if some of the arrays have no cotangents.
     joined, parted = ravel_pytree(both)
 
     def solve(_, vector):
@@ -225,8 +225,8 @@ def started(
 ) -> tuple[jax.Array, jax.Array]:
     """Solve A x = b from the starting vector `near`, or from 0 if the residual is smaller there.
 
-    `solver` is a function (b, tolerance) -> solution, and its residual divided by |b|. `tolerance` is the upper bound
-    of |b - A x| / |b|. Returns the solution, and its residual divided by |b|.
+    `solver` is a function (b, tolerance) -> (solution, residual divided by |b|). `tolerance` is the upper bound of |b -
+    A x| / |b|. Return the solution and its residual, divided by |b|.
     """
     left, size = b - matvec(near), jnp.linalg.norm(b)
     helps = jnp.linalg.norm(left) < size
@@ -285,7 +285,7 @@ def differentiable_solve(
 
 
 def one_by_one(function: Callable) -> Callable:
-    """Return an equivalent function. On a CPU, `jax.vmap` of it computes the members of a batch one after another.
+    """Return an equivalent function. With `jax.vmap` on a CPU, it computes the members of a batch one after another.
 
     Otherwise all members would wait for the member with the most iterations, and products of several small matrices
     are slow on a CPU. `jax.custom_batching.sequential_vmap` is not used because it fails in second derivatives.

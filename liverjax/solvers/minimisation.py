@@ -1,4 +1,4 @@
-"""Minimise the energy of a step, if elements are inverted at its beginning or if the usual Newton iterations fail.
+"""Minimise the energy of a step, if elements are inverted at the beginning or if the usual Newton iterations fail.
 
 `liverjax.solvers.step_cutting` does the usual Newton iterations. The minimisation uses the true tangent if conjugate
 gradients find no negative curvature in it. Otherwise it uses a tangent without negative eigenvalues
@@ -12,8 +12,8 @@ positions, the solution is a minimum. So only positions are varied, and the pres
 quadratic elements the pressures are eliminated from a tangent without negative eigenvalues, so that the tangent is
 positive definite.
 
-Forces without an energy, for example friction, are held constant during an iteration, so that they have an energy in
-this iteration. At the beginning of the iteration, the gradient of the total energy is the residual.
+Forces without an energy, for example friction, are held constant during an iteration. Constant forces have an energy.
+At the beginning of the iteration, the gradient of the total energy is the residual.
 """
 
 from typing import NamedTuple
@@ -60,7 +60,7 @@ class _Descent(NamedTuple):
     r: jax.Array
     relative: jax.Array
     by: jax.Array
-    definite: jax.Array  # number of iterations with a definite tangent until the true tangent is tried
+    definite: jax.Array  # number of iterations without the true tangent, until the true tangent is tried again
     patience: jax.Array  # the next value of `definite` if the true tangent fails again
     indefinite: jax.Array  # whether the last true tangent was not positive definite
     stuck: jax.Array

@@ -87,7 +87,8 @@ class _Iterate(NamedTuple):
 def _halving_newton(residual, start, precondition, scale, options):
     """Run Newton's method. A step is halved if |r| does not decrease.
 
-    Residual and tangent occur only once in the compiled program. This makes the compilation twice as fast.
+    The code of the residual and of the tangent occurs only once in the compiled program. So the compilation is twice as
+    fast.
     """
     goal = options.tolerance * scale
     method = conjugate_gradients if options.symmetric else stabilised_biconjugate_gradients
@@ -135,6 +136,6 @@ def _halving_newton(residual, start, precondition, scale, options):
     end = jax.lax.while_loop(lambda c: ~c.done, step, begin)
     size = norm(end.r)
     code = jnp.where(size <= goal, status.CONVERGED, jnp.where(jnp.isfinite(size), status.STALLED, status.NOT_FINITE))
-    # Counts are returned as floating-point numbers: implicit differentiation gives every output a tangent.
+    # Counts are returned as floating-point numbers: implicit differentiation gives every output a JAX tangent.
     counts = (code, end.iterations - 1, end.linear_iterations)
     return end.q, NewtonStatistics(*(n.astype(start.dtype) for n in counts), size / scale)

@@ -27,8 +27,9 @@ from liverjax.tensors.places import given
 
 
 class PointMatrix(NamedTuple):
-    """Matrix of the linearised equations: the stiffness of the nodal forces and, if the vertices have pressures, the
-    derivatives of the volumes with respect to positions, and the block of these pressures.
+    """Matrix of the linearised equations. It contains the stiffness of the nodal forces. If the vertices have
+    pressures, it also contains the derivatives of the volumes with respect to the positions, and the block of the
+    pressures.
 
     Each of E elements has Q integration points.
     """

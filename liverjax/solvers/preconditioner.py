@@ -60,7 +60,7 @@ def _inverse(E: jax.Array) -> jax.Array:
 
 
 def coarse_of_product(mesh: TetMesh, product: Callable[[jax.Array], jax.Array]) -> Coarse:
-    """Make the coarse space of a symmetric matrix of the vertices that is given by its products with vectors (V,).
+    """Make the coarse space of a symmetric matrix of the vertices. `product` multiplies this matrix by a vector (V,).
 
     One product is needed for each coarse motion.
     """

@@ -24,7 +24,7 @@ class StepStatistics(NamedTuple):
     status: jax.Array
     iterations: jax.Array  # Newton iterations of all substeps
     linear_iterations: jax.Array
-    cuts: jax.Array  # how often a substep was halved
+    cuts: jax.Array  # number of times that a substep was halved
     residual: jax.Array  # norm of the residual forces, divided by the norm of all forces
 
 
@@ -33,7 +33,7 @@ class StepOptions(NamedTuple):
 
     tolerance: float = 1e-8  # upper bound of |r|, relative to the norm of all forces
     max_iterations: int = 25  # maximum number of Newton iterations per substep
-    one_step: bool = False  # only one linear solve per step; its result has no correct derivatives
+    one_step: bool = False  # only one linear solve per step; derivatives of its result are wrong
     max_halvings: int = 6
     max_cuts: int = 12
     #: Whether derivatives are possible. Without them, JAX prepares the compiled program in two thirds of the time.
@@ -47,8 +47,9 @@ class Kept(NamedTuple):
     made: jax.Array  # False if there is no tangent yet
     pace: jax.Array  # linear iterations per digit of accuracy when the preconditioner was new
     worn: jax.Array  # whether the preconditioner needs many more iterations than when it was new
-    #: `surprise`: the last root minus its prediction. `trust`: a factor from 0 to 1, with which the surprise of the
-    #: previous step was closest to `surprise`. The next guess is the prediction plus `trust` times `surprise`.
+    #: `surprise`: the last root minus its prediction. `trust`: the factor from 0 to 1 for which `trust` times the
+    #: surprise of the previous step is closest to `surprise`. The next guess is the prediction plus `trust` times
+    #: `surprise`.
     surprise: jax.Array
     trust: jax.Array
     beside: jax.Array | None = None  # the additional unknowns at the root (`Problem.beside`)
@@ -58,7 +59,7 @@ class Kept(NamedTuple):
 
 
 class Beside(NamedTuple):
-    """Additional unknowns, for example fluid pressures. `Problem.residual` solves for them at every q, from a guess."""
+    """Additional unknowns, for example fluid pressures. `Problem.residual` computes them at every q from a guess."""
 
     before: jax.Array  # a guess at the beginning of the step
     #: Function (q, s, guess) -> values of the additional unknowns at q.
@@ -66,7 +67,7 @@ class Beside(NamedTuple):
     #: Function (additional unknowns at a nearby q, factor that multiplies the tolerance) -> guess for `residual` and
     #: `solved`.
     guess: Callable[[jax.Array, Number], tuple]
-    #: Function (q, additional unknowns) -> r, and the residual of the equation of the additional unknowns. Both are
+    #: Function (q, additional unknowns) -> (r, residual of the equation of the additional unknowns). Both are
     #: differentiated together, so that no inner solve is differentiated. If dr/dq is symmetric, this joint derivative
     #: is symmetric too.
     lack: Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
@@ -96,10 +97,10 @@ class Problem(NamedTuple):
     adjoint: Callable[[Any, jax.Array, Number, int, Earlier], tuple[jax.Array, jax.Array, jax.Array]] | None = None
     #: Whether dr/dq and its preconditioner are symmetric.
     symmetric: bool = True
-    #: Whether a substep of Newton's method begins with the term dr/ds. With only one linear solve, this term is always
-    #: used.
+    #: Whether the first right-hand side of a substep contains the term dr/ds. With only one linear solve, this term is
+    #: always used.
     moved: bool = True
-    #: Norm of the change of r that the rounding of q causes.
+    #: Norm of the change of r due to the rounding of q.
     roundoff: Any = 0.0
     beside: Beside | None = None
     #: Whether dr/dq can jump, for example where contact begins.
@@ -122,8 +123,8 @@ class Potential(NamedTuple):
     definite: Callable[..., Any]
     #: Function (q, s) -> minimum volume ratio J of the elements, which is 0 or negative if elements are inverted.
     volume: Callable[[jax.Array, Any], jax.Array]
-    #: The problem of the body with another law, with a finite energy in inverted elements. None if the law of the body
-    #: already has such an energy.
+    #: The problem of the same body with another law, whose energy is finite in inverted elements. None if the law of
+    #: the body already has such an energy.
     surrogate: Problem | None
     #: A pair: unknowns of the reference shape, and whether the unknowns at the beginning of the step are only a guess.
     #: If the guess fails, the solution is followed from the reference shape. None: the step never begins at a guess.

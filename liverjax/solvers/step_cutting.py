@@ -1,11 +1,12 @@
 """Newton's method along a load: the solution is followed from the last equilibrium, if necessary in substeps.
 
-The residual r(q, s) contains the loads and prescribed motions at the beginning of the step for s = 0, and at its end
-for s = 1. At the beginning of a step, forces may be out of balance (inertia, a fluid). So the equation r(q, s) - (1 -
-s) r(start, 0) = 0 is solved, where `start` contains the unknowns at the beginning of the step. For s = 0, its solution
-is q = start. A part of the load, from s to s + ds, is called a substep. Every substep begins with a linear solve, with
-the tangent at its beginning and the right-hand side -(r + dr/ds ds). So a prescribed motion enters through the tangent
-and not as a jump. If a substep fails, it is halved. Only the root at s = 1 is returned and differentiated.
+The residual r(q, s) contains loads and prescribed motions: at the beginning of the step for s = 0, and at the end of
+the step for s = 1. At the beginning of a step, forces may be out of balance (inertia, a fluid). So the equation r(q, s)
+= (1 - s) r(start, 0) is solved, where `start` contains the unknowns at the beginning of the step. For s = 0, the
+solution is q = start. A part of the load, from s to s + ds, is called a substep. Every substep begins with a linear
+solve, with the tangent at the beginning of the substep and the right-hand side -(r + dr/ds ds). So a prescribed motion
+enters through the tangent and not as a jump. If a substep fails, it is halved. Only the root at s = 1 is returned and
+differentiated.
 """
 
 from functools import partial
@@ -31,11 +32,11 @@ from liverjax.solvers.problem import (
 
 #: If Newton's method makes no progress, the residual counts as roundoff in two cases. The relative residual is below
 #: _PRECISIONS times the machine precision (5e-4 in float32; in tests, the relative residual stopped at about 1e-4), or
-#: the residual is below ROUNDINGS times the effect of rounded positions. Then shorter steps do not help.
+#: the residual is below ROUNDINGS times `Problem.roundoff`. Then shorter steps do not help.
 _PRECISIONS, ROUNDINGS = 4096, 8
 
 #: If the derivative of the residual can jump (kinks) and halving does not help, the full step q + dq is used, at most
-#: this number of times per substep. The tangent is different beyond a kink.
+#: this number of times per substep. The tangent changes at a kink.
 _LEAPS = 8
 
 #: Without inertia, a guess is not used if the volume ratio of any element is below this value (robust steps only). Such
@@ -46,7 +47,7 @@ _FLAT = 0.1
 _ONE_STEP = 1e-4
 #: A new tangent is made if |r|, divided by the norm of the right-hand side of the last direction, exceeds this value.
 _CONTRACTION = 0.15
-#: A new preconditioner is made if the linear iterations per digit exceed this multiple of their first value.
+#: A new preconditioner is made if the number of linear iterations per digit exceeds this multiple of its first value.
 _WEAR = 1.2
 #: Tolerance of the solves for derivatives, divided by the tolerance of the step.
 _ADJOINT = 0.1
@@ -70,7 +71,7 @@ class _Point(NamedTuple):
     s: jax.Array
     q_begin: jax.Array  # unknowns at the beginning of the current substep
     guessing: jax.Array  # whether the substep began at the guess
-    unbalanced: jax.Array  # r at the step's beginning, 0 while guessing
+    unbalanced: jax.Array  # r at the beginning of the step; 0 if the substep began at the guess
     s_begin: jax.Array
     ds: jax.Array
     launch: jax.Array  # whether the next evaluation is at the beginning of a substep
@@ -143,8 +144,8 @@ def solve(
         guessing = jnp.array(guess is not None)
         return _follow(problem, start, start if guess is None else guess, guessing, kept, options)
 
-    # There are two derivative rules. The search has no derivative, so any function is good enough for its rule. The
-    # derivative of the root uses the tangent at the root.
+    # The result of the search counts as a constant, so its derivative rule may be any function. Then `_with_derivative`
+    # gives the root its derivative.
     if options.differentiable:
         found_by = jax.lax.custom_root(lambda q: q, start, follow, lambda _, y: jnp.zeros_like(y), has_aux=True)
     else:
@@ -161,7 +162,7 @@ def solve(
 
 
 def _foretold(vector: jax.Array, before: jax.Array) -> jax.Array:
-    """Return the factor (0 to 1) with which `before`, the vector of the last step, is closest to `vector`."""
+    """Return the factor f from 0 to 1 for which f times `before` (from the last step) is closest to `vector`."""
     square = jnp.vdot(before, before)
     return jnp.clip(jnp.vdot(vector, before) / jnp.where(square > 0, square, 1.0), 0.0, 1.0)
 
@@ -213,8 +214,8 @@ def _guarded(problem: Problem, q: jax.Array) -> jax.Array:
     """Return q. A derivative through this function is NaN on purpose: a correct derivative never passes through it.
 
     Suppose that a loop contains a root and is differentiated twice, the second time in reverse mode. Up to jax 0.10,
-    the second derivative does not use the derivative rule of the root (jax 0.11.2 does). That derivative would treat
-    the root as a constant, and be wrong without a warning.
+    the second derivative does not use the derivative rule of the root (jax 0.11.2 does). Without the NaN, that
+    derivative would treat the root as a constant: it would be wrong without a warning.
     """
     leaves = [jnp.ravel(leaf)[:1] for leaf in jax.tree.leaves(problem.numbers)]
     some = [leaf for leaf in leaves if leaf.size and jnp.issubdtype(leaf.dtype, jnp.floating)]
@@ -226,7 +227,7 @@ def _guarded(problem: Problem, q: jax.Array) -> jax.Array:
 
 
 def _evaluated_near(problem: Problem, q: jax.Array, s: jax.Array, beside: jax.Array | None, looser: Number) -> tuple:
-    """Evaluate the residual at q. The solve for the other unknowns begins at `beside`, their values at a nearby q."""
+    """Evaluate the residual at q. `beside`: guess of the additional unknowns (their values at a nearby q)."""
     if problem.beside is None or beside is None:
         return problem.residual(q, s)
     return problem.residual(q, s, problem.beside.guess(beside, looser))
@@ -238,7 +239,7 @@ def _one_step(problem: Problem, start: jax.Array, kept: Kept, options: StepOptio
         problem = problem._replace(tangent=problem.potential.definite)
     zero, one = jnp.zeros((), start.dtype), jnp.ones((), start.dtype)
     r, _, by = problem.residual(start, zero)
-    load = -r - _along(problem, start, zero)  # the loads and motions at the end of the step
+    load = -r - _along(problem, start, zero)  # loads and motions at the end of the step
     at = (start, zero, by)
     finest = 16 * float(jnp.finfo(start.dtype).eps)
     wanted = jnp.clip(0.3 * options.tolerance, finest, _ONE_STEP)
@@ -340,10 +341,10 @@ def _first_point(
 class _Verdict(NamedTuple):
     """The decision that follows from the residual at a trial iterate."""
 
-    accepted: jax.Array  # the trial iterate replaces the last accepted one
+    accepted: jax.Array  # the trial iterate replaces the last accepted iterate
     better: jax.Array
     converged: jax.Array  # whether the iterations of the substep have converged
-    arrived: jax.Array  # whether the last substep has converged, so that the step is finished
+    arrived: jax.Array  # whether the last substep has converged (the step is then finished)
     remake: jax.Array
     failed: jax.Array
     lost: jax.Array  # the guess leads to no solution: the last equilibrium is tried next, and no cut is counted
@@ -417,7 +418,7 @@ def _iterate(problem: Problem, options: StepOptions, start: jax.Array, c: _Point
         load = load - jax.lax.cond(v.launch_now, lambda: ds * _along(problem, trial, s), lambda: jnp.zeros_like(r))
     slow = c.remake | (size > _CONTRACTION * c.aim)
     renew = (v.launch_now & (~c.guessing | ~c.kept.made)) | (v.go_on & ~v.launch_now & slow)
-    # The linear solve is not more accurate than is useful (Eisenstat and Walker 1996) or than the tolerance requires.
+    # The linear solve is only as accurate as is useful (Eisenstat and Walker 1996) and as the tolerance requires.
     ratio = size / jnp.where(c.aim > 0, c.aim, 1.0)
     reach = 0.3 * jnp.where(renew, ratio**2, ratio)
     goal = 0.3 * options.tolerance / jnp.maximum(relative, jnp.finfo(relative.dtype).tiny)

@@ -55,17 +55,17 @@ class Lumped(NamedTuple):
 class ReducedSponge(NamedTuple):
     """Data of the porous body that are the same in all steps."""
 
-    porosity: Porosity  # with parameters at the points
-    lumped: Lumped | None  # None if the mesh has more than 4 vertices per point; then points store the fluid
+    porosity: Porosity  # parameters have one value per point
+    lumped: Lumped | None  # None if the mesh has more than 4 vertices per point (the points then store the fluid)
 
 
 class Flowing(NamedTuple):
     """Data of the fluid that are constant during a step (m pressure modes, S points; A and S: module docstring)."""
 
-    porosity: Porosity  # with parameters at the points
+    porosity: Porosity  # parameters have one value per point
     inverse: jax.Array  # inverse of A (m, m) [Pa]
     stored: jax.Array  # (m,) [m^1.5] S p_before; in the lagged scheme S p_before - c, with the last change of volume c
-    averages: jax.Array  # modes at the points, times their weights (S, m) [m^1.5]
+    averages: jax.Array  # modes at the points, times weights of the points (S, m) [m^1.5]
     J: jax.Array  # volume ratios at the beginning of the step (S,)
 
 
@@ -125,7 +125,7 @@ def storage_and_flow(model: ReducedModel, porosity: Porosity, F: jax.Array) -> t
     matrix = as_matrix(F)
     volume = w * jnp.maximum(determinant(matrix), darcy.LEAST_J)
     # In the current shape, grad psi = cof(F) G / J with the reference gradient G, and the volume is J w (`darcy.flow`).
-    # The root does not contain kappa, because the slope of a root is infinite at 0.
+    # The square root does not contain kappa, because the derivative of a square root is infinite at 0.
     root = jnp.sqrt(w**2 / volume)
     scaled = tuple(tuple((root * entry)[None] for entry in row) for row in cofactor(matrix))
     g = matvec(scaled, tuple(jnp.moveaxis(modes.slopes, 1, 0)))
@@ -143,7 +143,7 @@ def _stored_at_vertices(model: ReducedModel, sponge: ReducedSponge, J: jax.Array
 
 
 def _products(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Return the scalar products (m, m) of m vectors with m others: the arrays (k, S) in `a` and `b` (m, k, S)."""
+    """Return the scalar products (m, m) of m vectors in `a` and m vectors in `b`. Each vector is an array (k, S)."""
     return a.reshape(a.shape[0], -1) @ b.reshape(b.shape[0], -1).T
 
 
@@ -185,7 +185,7 @@ def volume_blocks(model: ReducedModel, own: Flowing, F: Matrix, pairs: tuple[tup
 
 
 def stiffness_of_pressures(model: ReducedModel, own: Flowing, F: Matrix) -> jax.Array:
-    """Return the stiffness (n, n) [N m^-4] due to the change of the pressures with the n reduced coordinates of the
+    """Return the stiffness (n, n) [N m^-4] due to the pressures, which change with the n reduced coordinates of the
     motion."""
     n = model.number_of_modes
     if own.porosity.scheme == "lagged":

@@ -62,7 +62,8 @@ def linear_fluid(scene: Scene, free: np.ndarray) -> LinearFluid:
 
     shape = mesh.weights.shape
     J = scipy.sparse.hstack([slopes[i] for i in range(3)]).tocsc()
-    # So far, the columns are all x, then all y, then all z. Now component c of node k gets the column 3 k + c.
+    # Until here, the columns are ordered by component: first all x, then all y, then all z. Now component c of node k
+    # gets the column 3 k + c.
     J = J[:, np.arange(3 * mesh.number_of_nodes).reshape(3, -1).T.ravel()][:, free]
     unknown = np.flatnonzero(np.asarray(unknown_pressures(porosity, mesh, mesh.points.dtype)))
     values, vertex_slopes = values[:, unknown], [g[:, unknown] for g in vertex_slopes]
@@ -90,8 +91,8 @@ def _point_operators(mesh: TetMesh) -> "tuple[scipy.sparse.csr_array, list, list
     rows = np.arange(Q * E).reshape(Q, E)
 
     def matrix(entries: np.ndarray, count: int) -> "scipy.sparse.csr_array":
-        """Assemble the sparse matrix (Q E, count) from its entries (n, Q, E): n nodes and Q integration points in each
-        of E elements."""
+        """Assemble a sparse matrix with one row per integration point and `count` columns. `entries` (n, Q, E): n nodes
+        and Q integration points in each of E elements."""
         nodes = np.broadcast_to(mesh.element_nodes_on_host[: len(entries), None], entries.shape)
         at = (np.broadcast_to(rows, entries.shape).ravel(), nodes.ravel())
         return scipy.sparse.csr_matrix((entries.ravel(), at), shape=(Q * E, count))

@@ -18,13 +18,13 @@ from liverjax.scenes.scene import Scene, named_physics
 from liverjax.simulation.obstacle_forces import obstacle_forces
 from liverjax.simulation.run import Result
 
-#: A warning is given if the depth of the obstacle between the contact points exceeds this fraction of its approach (see
-#: `missed_depth`).
+#: A warning is given if the depth of the obstacle in the body between the contact points exceeds this fraction of the
+#: obstacle's approach (see `missed_depth`).
 BETWEEN = 0.25
 
 
 def _between_points(name: str, obstacle: Obstacle, scene: Scene, result: Result, moved: jax.Array) -> list[str]:
-    """Warn if the obstacle overlaps the body between the contact points, at its last or largest displacement.
+    """Warn if the obstacle overlaps the body between the contact points, at the largest or the last displacement.
 
     `moved` (T, 3) contains the displacements [m] of the obstacle at T steps.
     """
@@ -42,10 +42,11 @@ def _between_points(name: str, obstacle: Obstacle, scene: Scene, result: Result,
 
 
 def _lost_contact(name: str, obstacle: Obstacle, scene: Scene, result: Result, moved: np.ndarray) -> str:
-    """Warn if the obstacle passed the surface within a step. `moved` (T + 1, 3): its displacements from step 0 on."""
+    """Warn if the obstacle passed through the body's surface within a step. `moved` (T + 1, 3): displacements [m] of
+    the obstacle, from step 0 on."""
     ways, radius = np.linalg.norm(np.diff(moved, axis=0), axis=1), float(np.asarray(obstacle.radius))
     centres, axis = np.asarray(obstacle.position, float) + moved, np.asarray(obstacle.axis, float)
-    if obstacle.shape == "cylinder":  # a motion of a cylinder along its axis does not count
+    if obstacle.shape == "cylinder":  # motion along the axis of a cylinder does not count
         ways = np.linalg.norm(np.diff(moved - np.outer(moved @ axis, axis), axis=0), axis=1)
     for k in np.flatnonzero(ways > radius) if radius > 0 else []:
         before = scene.mesh.points if k == 0 else result.positions[k - 1]
@@ -62,7 +63,7 @@ def _lost_contact(name: str, obstacle: Obstacle, scene: Scene, result: Result, m
 
 
 def of_obstacles(scene: Scene, result: Result) -> list[str]:
-    """Warn about obstacles (not planes) that passed the surface, or overlap the body between the contact points."""
+    """Warn about obstacles (not planes) that passed through the surface, or overlap the body between contact points."""
     said, steps = [], len(result.times)
     obstacles = [(name, physics) for name, physics in named_physics(scene) if isinstance(physics, Obstacle)]
     pressed = any(isinstance(physics, PressedObstacle) for _, physics in obstacles)
@@ -80,7 +81,7 @@ def of_obstacles(scene: Scene, result: Result) -> list[str]:
 
 
 def of_friction_alone(scene: Scene, result: Result) -> list[str]:
-    """Warn if a static run failed and only friction prevents sliding of the body, or of a separate piece of it."""
+    """Warn if a static run failed and only friction keeps the body, or a separate piece of it, from sliding."""
     rough = any(isinstance(physics, RoughObstacle) for physics in scene.physics)
     fine = (status.CONVERGED, status.ONE_STEP, status.STALLED)
     if not rough or scene.solve.kind != "static" or np.isin(result.statistics.status, fine).all():

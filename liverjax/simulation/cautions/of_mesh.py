@@ -15,9 +15,10 @@ from liverjax.simulation.run import Result
 LONGEST = 1.0
 #: No organ and no sample is shorter than this [m]. If metres are read as millimetres, a liver seems to be 0.2 mm long.
 SHORTEST = 1e-3
-#: A displacement that is not larger than this fraction of the body's size counts as zero.
+#: A displacement of at most this fraction of the body's size counts as zero.
 _ROUNDOFF = 1e-13
-#: Elements with a quality (see `qualities`) below this value are slivers: gradients there are 100 times less accurate.
+#: Elements with a quality (see `qualities`) below this value are slivers. In slivers, gradients are 100 times less
+#: accurate.
 SLIVER = 0.01
 #: If the mesh error is below this fraction of the largest displacement, no finer mesh is recommended.
 _SMALL = 0.02
@@ -60,7 +61,8 @@ def mesh_sentence(scene: Scene, result: Result) -> str:
 
 
 def _pressure_errors(result: Result) -> tuple[str, str]:
-    """Return two parts of `mesh_sentence` (or ""): that the pressure error is omitted, and how large this error is."""
+    """Return two parts of `mesh_sentence`: a note that the pressure error is omitted, and the pressure error. A part
+    may be empty."""
     if result.pressure is None or result.mesh_error is None:
         return "", ""
     if result.mesh_error.pressure is None:
@@ -109,7 +111,7 @@ _LOCKING = 100.0
 
 
 def of_locking(scene: Scene) -> list[str]:
-    """Warn if quadratic elements are too stiff (lock). With volumetric = "mixed" they would not lock."""
+    """Warn if quadratic elements are too stiff (lock). With volumetric = "mixed" these elements would not lock."""
     if scene.mesh.order == 1 or form_of_volumes(scene) != "element" or scene.porosity is not None:
         return []
     try:

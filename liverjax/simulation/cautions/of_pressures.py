@@ -1,4 +1,4 @@
-"""Warnings about the pressures of a porous run and about the thickness of its elements at drained nodes."""
+"""Warnings about the pressures of a porous run and about the thickness of the elements at drained nodes."""
 
 import numpy as np
 
@@ -46,7 +46,8 @@ def _heights_beside(scene: Scene, at: np.ndarray, faces: np.ndarray) -> np.ndarr
     return np.asarray(3 * np.abs(np.asarray(scene.mesh.volumes)[at]) / area)
 
 
-#: A warning about the elements at the drained nodes is given if it applies to more than this fraction of them.
+#: A warning about the elements at the drained nodes is given if it applies to more than this fraction of these
+#: elements.
 _MANY = 0.2
 
 
@@ -88,8 +89,8 @@ def of_drained_layer(scene: Scene, seconds: float, when: str) -> list[str]:
 
 
 def _moduli_and_permeability(scene: Scene, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return numbers (n,) of the elements with the numbers `at` (n,): the longitudinal modulus K0 + 4/3 mu [Pa], the
-    storage modulus K_lim [Pa], and the permeability [m^4/(N s)]. Parameters of regions are included.
+    """Return three properties (n,) of the elements with the numbers `at` (n,): the longitudinal modulus K0 + 4/3 mu
+    [Pa], the storage modulus K_lim [Pa], and the permeability [m^4/(N s)]. Parameters of regions are included.
 
     Raises:
         InputError: the law has no moduli.
@@ -98,7 +99,7 @@ def _moduli_and_permeability(scene: Scene, at: np.ndarray) -> tuple[np.ndarray, 
     sponge = own.porosity
     assert sponge is not None
 
-    def there(value: Number) -> np.ndarray:  # the median of the points of each element
+    def there(value: Number) -> np.ndarray:  # median over the integration points of each element
         shape = np.broadcast_shapes(np.shape(value), (scene.mesh.number_of_elements,))
         return np.asarray(np.median(np.broadcast_to(value, shape)[..., at].reshape(-1, len(at)), axis=0), float)
 
@@ -114,8 +115,8 @@ _FOLLOWS = 0.4
 
 
 def _least_steps(scene: Scene, at: np.ndarray, heights: np.ndarray) -> np.ndarray | None:
-    """Return the smallest dt (n,) [s] without overshoot in the elements `at` with the given heights (n,) [m], 0 without
-    flow. Returns None if the law has no moduli."""
+    """Return the smallest dt (n,) [s] without overshoot, for the elements `at` with the given heights (n,) [m]. The
+    value is 0 if nothing flows. Return None if the law has no moduli."""
     try:
         M, _, kappa = _moduli_and_permeability(scene, at)
     except InputError:
@@ -124,7 +125,7 @@ def _least_steps(scene: Scene, at: np.ndarray, heights: np.ndarray) -> np.ndarra
 
 
 def _of_overshoot(scene: Scene, P: np.ndarray) -> list[str]:
-    """Warn if pressures P (T, V) at T steps are higher beside the drained nodes than further inside.
+    """Warn if the pressures P (T, V) of T steps are higher next to the drained nodes than further inside.
 
     The warning is about the elements at the drained nodes for which dt is too short.
 
@@ -147,7 +148,7 @@ def _of_overshoot(scene: Scene, P: np.ndarray) -> list[str]:
     heights = _heights_beside(scene, at, faces)
     least = _least_steps(scene, at, heights)
     short = np.ones(len(at), bool) if least is None else float(scene.solve.dt) < least
-    if short.mean() <= _MANY:  # then short steps are not the cause
+    if short.mean() <= _MANY:  # short steps are not the cause of an overshoot
         return []
     beside = np.zeros(V, bool)
     beside[tets[at].ravel()] = True

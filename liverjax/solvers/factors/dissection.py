@@ -1,21 +1,22 @@
 """Nested dissection of a mesh (George 1973, SIAM J. Numer. Anal. 10, 345): an order to eliminate groups of nodes.
 
 The elements are divided into two parts, and each part is divided again in the same way. The nodes that both parts share
-are eliminated after the others. The work of their elimination grows with the cube of their number. Planes normal to
-nine directions are tried, and the plane with the least estimated work is used. In a mesh without layers, the elements
-on the two sides of a plane share many nodes. In such a mesh it is better to use the smallest set of nodes that
-separates both sides. This set is the minimum cut of a graph (Ford and Fulkerson 1956, Can. J. Math. 8, 399).
+are eliminated after the other nodes. Their elimination needs work that grows with the cube of the number of shared
+nodes. Planes normal to nine directions are tried, and the plane with the least estimated work is used. In a mesh
+without layers, the elements on the two sides of a plane share many nodes. In such a mesh it is better to use the
+smallest set of nodes that separates both sides. This set is the minimum cut of a graph (Ford and Fulkerson 1956, Can.
+J. Math. 8, 399).
 """
 
 from typing import Any, NamedTuple
 
 import numpy as np
 
-#: LEAF: a group of at most this number of nodes is not divided. MANY: for a group of more nodes than this, diagonal
+#: LEAF: a part with at most this number of nodes is not divided. MANY: in a part with more nodes than this, diagonal
 #: planes and minimum cuts are also tried.
 LEAF, MANY = 40, 400
-#: LEAST: minimum fraction of the elements on each side of a plane. BESIDE: a minimum cut lies near its plane. On
-#: each side, it passes only through the nearest elements, which are this fraction of all elements of the part.
+#: LEAST: minimum fraction of the elements on each side of a plane. BESIDE: fraction of the elements of a part, on each
+#: side of the plane, through which a minimum cut may pass. These are the elements next to the plane.
 LEAST, BESIDE = 0.25, 0.07
 #: A minimum cut is used if its estimated work is below this fraction of the estimated work of the plane. Planes are
 #: preferred because they leave parts with straighter boundaries.
@@ -142,13 +143,14 @@ def _work_of_cuts(nodes: np.ndarray, part: _Part, span: tuple[np.ndarray, np.nda
 def _smallest_cuts(
     near: np.ndarray, nodes: np.ndarray, span: tuple[np.ndarray, np.ndarray], ends: tuple[int, int]
 ) -> list[np.ndarray]:
-    """Return which elements (h,) are on the first side, for the first and for the last of all minimum cuts.
+    """Return two boolean arrays (h,): whether each element is on the first side of the first minimum cut, and of the
+    last minimum cut.
 
     Args:
         near: nodes (n, h) of the h elements from low to high - 1, in the order of the elements; n nodes each.
         nodes: (k,) nodes, in ascending order, through which a cut may pass. Other nodes do not connect the two sides.
         span: first and last element of each node in this order.
-        ends: low and high. Elements before low are on the first side. Elements from high on are on the second.
+        ends: low and high. Elements before low are on the first side, and elements from high on are on the second side.
     """
     import scipy.sparse
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow
@@ -177,7 +179,7 @@ def _smallest_cuts(
 
 
 def _neighbours_together(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Sort the nodes so that nodes which are near in space follow each other."""
+    """Sort the nodes so that nodes which are close to each other in space follow each other in the list."""
     if len(nodes) <= 8:
         return nodes
     side = points[nodes, np.argmax(np.ptp(points[nodes], axis=0))]

@@ -2,15 +2,15 @@
 
 `liverjax.solvers.factors.dissection` gives the order of elimination. Each group of nodes is eliminated in a dense
 matrix of the group and its border: the later unknowns that are coupled with the group (Duff and Reid 1983, ACM TOMS 9,
-302). `PIVOTS` unknowns are eliminated at a time, so that nearly all work is in matrix products. Since the matrices are
-symmetric, only the lower triangles are computed. Groups are eliminated in parallel, one per core, as soon as their
+302). `PIVOTS` unknowns are eliminated at a time, so that nearly all work is in matrix products. The matrices are
+symmetric, so only the lower triangles are computed. Groups are eliminated in parallel, one per core, as soon as their
 child groups are eliminated. While cores are idle, the matrix products of a group are divided into parts (tiles) that
 run in parallel on these cores. Pivots are chosen only among unknowns that are eliminated together.
 
 Large matrices are factorised in single precision, and solutions are refined iteratively. This needs half the time and
-memory, and the solution has the same number of digits. If the refinement does not converge, double precision is used.
-Factors that would not fit in memory are stored as 16-bit integers, with a scale factor for each row. This halves the
-memory again, and needs about two more refinement steps.
+memory, and the solution has the same accuracy as in double precision. If the refinement does not converge, double
+precision is used. Factors that would not fit in memory are stored as 16-bit integers, with a scale factor for each row.
+This halves the memory again, and needs about two more refinement steps.
 """
 
 import itertools
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 SINGLE_FROM = 20_000
 #: PIVOTS: number of unknowns of a group that are eliminated together. TILE: number of columns of a tile.
 PIVOTS, TILE = 128, 192
-#: A group and its descendants are eliminated one after the other, as one piece, if their work is less than this
-#: fraction of all work.
+#: If the work for a group and its descendants is less than this fraction of all work, these groups are one piece
+#: (task): they are eliminated one after the other.
 PIECE = 1 / 32
-#: STEPS: maximum number of refinement steps. ENOUGH: backward error at which they end. WRONG: a solution with a larger
-#: backward error is wrong.
+#: STEPS: maximum number of refinement steps. ENOUGH: the refinement ends below this backward error. WRONG: a solution
+#: with a larger backward error is wrong.
 STEPS, ENOUGH, WRONG = 12, 4e-16, 1e-11
 
 
@@ -44,11 +44,12 @@ class Front(NamedTuple):
 
     own: np.ndarray  # (n,) unknowns of the group
     border: np.ndarray  # (m,) later unknowns
-    children: list[int]  # indices of the earlier groups that leave their remaining matrices to this group
+    children: list[int]  # indices of the earlier groups whose Schur complements are added to this group
 
 
 class Eliminated(NamedTuple):
-    """Result for n unknowns that were eliminated together: A is their matrix, B couples them with m later unknowns."""
+    """Result for n unknowns that were eliminated together: A is the matrix of these n unknowns. B couples them with m
+    later unknowns."""
 
     own: np.ndarray  # (n,) eliminated unknowns
     after: np.ndarray  # (m,) later unknowns
@@ -124,8 +125,8 @@ def single_bytes(plan: list[Front], kind: np.dtype) -> float:
 def needed_bytes(plan: list[Front], kind: np.dtype, single: bool, small: bool) -> float:
     """Return the memory [bytes] for an elimination in the order of the plan. A parallel elimination needs more memory.
 
-    This memory contains the factor, the matrix of one group, and the lower triangles that eliminated groups have left
-    to their parent groups.
+    It is the memory for the factor, for the matrix of one group, and for the lower triangles of the Schur complements
+    that are not yet added to their parent groups.
     """
     each = (8 if kind.kind == "c" else 4) * (1 if single else 2)
     of_factor, waiting, most = 0.0, 0.0, 0.0
@@ -167,7 +168,7 @@ class _Elimination(NamedTuple):
     plan: list[Front]
     kind: np.dtype
     small: bool
-    rests: list[np.ndarray | None]  # the remaining matrix that each group leaves to its parent
+    rests: list[np.ndarray | None]  # Schur complement of each group, until it is added to the parent group
     steps: list[list[Eliminated]]  # results of each group
     running: dict[Future, int]  # pieces in progress
 
@@ -182,7 +183,7 @@ class _Elimination(NamedTuple):
         memory = np.empty(max((len(own) + len(border)) * len(own) for own, border, _ in fronts), self.kind)
         for k, front in zip(groups, fronts, strict=True):
             own, m = _own_columns(self.A, front, place, memory), len(front.border)
-            rest = np.zeros((m, m), self.kind, order="F")  # the children are added to its lower triangle
+            rest = np.zeros((m, m), self.kind, order="F")  # the child groups are added to its lower triangle
             for c in front.children:
                 left = self.rests[c]
                 if left is not None:  # None: the child is not coupled with later unknowns
@@ -253,7 +254,7 @@ def _scaled(A: Any) -> tuple[Any, np.ndarray]:
 
     A = A.tocsr()
     size, scale, in_row = abs(A.data), np.ones(A.shape[0]), np.diff(A.indptr)
-    known, other = np.flatnonzero(in_row), np.empty(A.nnz)  # new arrays would take longer than the arithmetic
+    known, other = np.flatnonzero(in_row), np.empty(A.nnz)  # reused, since a new array takes longer than the arithmetic
     for _ in range(3):
         largest = np.zeros(len(scale))
         if len(known):
@@ -269,7 +270,7 @@ def _scaled(A: Any) -> tuple[Any, np.ndarray]:
 def _own_columns(A: Any, front: Front, place: np.ndarray, memory: np.ndarray) -> np.ndarray:
     """Return the columns (n + m, n) of A for the n unknowns of a group with m border unknowns; 0 above the diagonal.
 
-    The row of each unknown of the group and its border is written into `place`.
+    For each unknown of the group and of its border, the row in these columns is written into `place`.
     """
     n, size = len(front.own), len(front.own) + len(front.border)
     place[front.own], place[front.border] = np.arange(n), np.arange(n, size)
@@ -283,10 +284,9 @@ def _own_columns(A: Any, front: Front, place: np.ndarray, memory: np.ndarray) ->
 
 
 def _add(own: np.ndarray, rest: np.ndarray, at: np.ndarray, left: np.ndarray) -> None:
-    """Add the lower triangle `left` of a child group to the columns `own` of the group and to the matrix `rest`.
-
-    `rest` is the matrix of the group's border. `at`: for each row of `left`, its index among the unknowns of the group
-    and its border (ascending). Entries with consecutive indices are added as one block.
+    """Add the Schur complement of a child group to the columns `own` of the group and to the matrix `rest` of its
+    border. `left` contains the lower triangle of the Schur complement. `at`: for each row of `left`, its index among
+    the unknowns of the group and its border (ascending). Entries with consecutive indices are added as one block.
     """
     n = own.shape[1]
     ends = np.unique([0, *(np.flatnonzero(np.diff(at) != 1) + 1), np.searchsorted(at, n), len(at)])
@@ -300,9 +300,9 @@ def _add(own: np.ndarray, rest: np.ndarray, at: np.ndarray, left: np.ndarray) ->
 def _eliminated(own: np.ndarray, rest: np.ndarray, front: Front, idle: Callable[[], int]) -> list[Eliminated]:
     """Eliminate a group of n unknowns, whose border has m unknowns.
 
-    `own` (n + m, n) contains the columns of the group. It is updated after each `PIVOTS` unknowns. `rest` (m, m) is the
-    matrix of the border. Its lower triangle is updated only once, at the end, since large matrix products are the
-    fastest.
+    `own` (n + m, n) contains the columns of the group. The columns are updated after each `PIVOTS` unknowns. `rest` (m,
+    m) is the matrix of the border. At the end, its lower triangle becomes the Schur complement. This is done in one
+    update, since large matrix products are the fastest.
     """
     n, every, found = len(front.own), np.concatenate([front.own, front.border]), []
     X = np.empty((n, len(rest)), own.dtype)
