@@ -2,7 +2,7 @@
 
 from types import ModuleType
 
-from liverjax.core import addresses  # imported first: it sets 64-bit mode and checks the version of JAX
+from liverjax.core import addresses  # first import: it sets 64-bit mode and checks the version of JAX
 
 
 def __getattr__(name: str) -> ModuleType:

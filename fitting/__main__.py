@@ -7,8 +7,8 @@ import sys
 from liverjax.commands.arguments import with_joined_numbers
 from liverjax.commands.exit_codes import end_if_stopped, exit_code, show_unknown_letters
 
-#: Names of the commands for tests that are not frequency sweeps. A command line without one of these names is for a
-#: frequency sweep.
+#: Names of the commands for tests that are not frequency sweeps. A command line that begins with none of these names is
+#: for a frequency sweep.
 COMMANDS = ("curves", "field", "relaxation", "creep", "indentation", "amplitude", "waves")
 
 

@@ -1,1 +1,2 @@
-"""Fit hyperelastic laws to strain sweeps, which are measured moduli as a function of the strain amplitude."""
+"""Fit hyperelastic laws to strain sweeps. A strain sweep contains moduli that were measured at several strain
+amplitudes."""

@@ -1,13 +1,13 @@
-"""One steady cycle of large shear: complex modulus of the first harmonic, and relative amplitude of the third harmonic.
+"""One steady cycle of large shear: the complex modulus of the first harmonic and the amplitude of the third harmonic.
 
-The sample is incompressible and isotropic, with a strain energy function W. W gives the instantaneous second
-Piola-Kirchhoff stress S. The relaxation of S does not depend on the strain (book chapter, section 4.2). The sample is
-in simple shear. The amount of shear is g(t) = a sin(wt), with the amplitude a and the angular frequency w. The shear
+The sample is incompressible and isotropic, with a strain energy function W. The instantaneous second Piola-Kirchhoff
+stress S is computed from W. The relaxation of S does not depend on the strain (book chapter, section 4.2). The sample
+is in simple shear. The amount of shear is g(t) = a sin(wt), with the amplitude a and the angular frequency w. The shear
 stress is S12 + g S22, which does not depend on the pressure. S is a sum of harmonics of w. Relaxation multiplies
 harmonic n by the modulus ratio m(nw) = G*(nw)/G0, with the complex modulus G* and the instantaneous modulus G0. In
-torsion between plates, every ring of the sample is in simple shear, and the amount of shear depends on the radius (a
-universal deformation: Rivlin 1949). So the torque is a sum over rings. A rheometer converts this torque into moduli as
-if the sample were linear.
+torsion between plates, every ring of the sample is in simple shear (a universal deformation: Rivlin 1949). The amount
+of shear depends on the radius, so the torque is a sum over rings. A rheometer converts this torque into moduli as if
+the sample were linear.
 """
 
 from typing import NamedTuple
@@ -21,10 +21,10 @@ from liverjax.laws.base import Law
 from liverjax.laws.terms.stretch_terms import stress_at_constant
 from liverjax.tensors.matrices import pack, unpack
 
-#: INSTANTS: number of instants at which the stress of a cycle is computed; harmonics of the stress above the 15th are
-#: neglected. RINGS: number of rings between the plates (Gauss points).
+#: INSTANTS: number of instants in a cycle. The stress is computed at these instants. Harmonics of the stress above the
+#: 15th are neglected. RINGS: number of rings between the plates (Gauss points).
 INSTANTS, RINGS = 32, 8
-#: Number of amounts of shear g at which the law is evaluated. S12/g and S22 are even functions of g, so they are
+#: The law is evaluated at this number of amounts of shear g. S12/g and S22 are even functions of g, so they are
 #: interpolated by polynomials in g^2.
 ASKED = 24
 
@@ -45,8 +45,8 @@ def reading(strains: np.ndarray, memories: np.ndarray, plates: str = "parallel")
 
     Args:
         strains: A strain amplitudes (A,) at the rim.
-        memories: M sets of modulus ratios m = G*(n omega) / G0, complex (M, `INSTANTS` / 2 + 1), for the harmonics
-            n = 0 to `INSTANTS` / 2 of the angular frequency omega. The reported moduli are linear in m.
+        memories: M sets of complex modulus ratios m = G*(n omega) / G0, shape (M, `INSTANTS` / 2 + 1). The harmonics n
+            of the angular frequency omega go from 0 to `INSTANTS` / 2. The reported moduli are linear in m.
         plates: "parallel", or "cone" (cone and plate, where the strain is the same everywhere).
 
     Raises:
@@ -73,8 +73,8 @@ def reading(strains: np.ndarray, memories: np.ndarray, plates: str = "parallel")
 
 
 def _radii_and_weights(plates: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the radius of each ring, divided by the radius of the rim, and the weight of each ring. A rheometer
-    reports the weighted sum of the moduli of the rings."""
+    """Return the radius of each ring, divided by the radius of the rim, and the weight of each ring. The modulus that a
+    rheometer reports is the weighted sum of the moduli of the rings."""
     if plates == "cone":
         return np.ones(1), np.ones(1)
     x, w = np.polynomial.legendre.leggauss(RINGS)
@@ -83,8 +83,8 @@ def _radii_and_weights(plates: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return the K Lagrange polynomials of the Chebyshev nodes `nodes` (K,), evaluated at the points `at` (...), as an
-    array (..., K) (barycentric form; Berrut, Trefethen 2004)."""
+    """Return the values (..., K) of the K Lagrange polynomials at the points `at` (...). `nodes` (K,) are Chebyshev
+    nodes. The formula is the barycentric form (Berrut, Trefethen 2004)."""
     k = np.arange(len(nodes))
     w = (-1.0) ** k * np.sin(np.pi * (k + 0.5) / len(nodes))
     off = at[..., None] - nodes
@@ -95,8 +95,8 @@ def _lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def first_and_third(law: Law, r: Reading, shares: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return two results at A strain amplitudes: the complex modulus (A,) [Pa] of the first harmonic, and the amplitude
-    (A,) of the third harmonic of the torque, divided by the amplitude of the first harmonic.
+    """Return two results for A strain amplitudes. The first is the complex modulus (A,) [Pa] of the first harmonic. The
+    second is the ratio (A,) of two amplitudes of the torque: third harmonic / first harmonic.
 
     Args:
         law: law of the instantaneous stress. Its volumetric energy is not used.
@@ -111,9 +111,9 @@ def first_and_third(law: Law, r: Reading, shares: jax.Array) -> tuple[jax.Array,
 
 
 def _instantaneous_stress(law: Law, F: jax.Array) -> jax.Array:
-    """Return the second Piola-Kirchhoff stress (K, 3, 3) [Pa] for K simple shears F (K, 3, 3). It comes from the
-    isochoric energy, or from the whole law if the law has no separate isochoric energy. F must be constant, because
-    the result may have no derivatives with respect to F."""
+    """Return the second Piola-Kirchhoff stress (K, 3, 3) [Pa] for K simple shears F (K, 3, 3). It is computed from the
+    isochoric energy, or from the whole law if the law has no separate isochoric energy. F must be constant, because the
+    result may have no derivatives with respect to F."""
     split = law.isochoric_part()
     if split is not None and split.stretch_energy is not None:
         return pack(stress_at_constant(split, unpack(F)))

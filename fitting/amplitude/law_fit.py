@@ -25,22 +25,23 @@ from liverjax.laws import Law
 #: The program compares the measured loss tangent with the loss tangent of the law. If their ratio changes by more than
 #: this fraction over the sweep, the program warns that the relaxation depends on the strain.
 CHANGED = 0.2
-#: At each end of the sweep, the loss tangent is the median of at most this number of points, because one point may be
-#: wrong.
+#: At each end of the sweep, the program uses the median loss tangent of at most this number of points, because a single
+#: point may be wrong.
 _AT_ENDS = 3
 
 
 class Memory(NamedTuple):
-    """Modulus ratio m = G*(n omega)/G0 for each harmonic n of the angular frequency omega (see `cycle`), from a Prony
-    series. If `series` is None, the ratio is 1 + i (loss tangent), with the same loss tangent for all harmonics n > 0.
+    """Modulus ratio m = G*(n omega)/G0 for each harmonic n of the angular frequency omega (see `cycle`). m is computed
+    from the Prony series `series`. If `series` is None, m is 1 + i (loss tangent) for every n > 0, with one loss
+    tangent for all n.
     """
 
     series: Maxwell | None = None
 
     def of(self, omega: float) -> np.ndarray:
-        """Return the modulus ratios m (1, N) of the series for N harmonics n = 0, 1, … of the angular frequency
-        `omega` [rad/s]. If there is no series, return (2, N): m is the first row plus the loss tangent times the second
-        row."""
+        """Return the modulus ratios m (1, N) of the series for N harmonics n = 0, 1, … of the angular frequency `omega`
+        [rad/s]. If there is no series, return an array (2, N). Then m is the first row plus the loss tangent times the
+        second row."""
         n = np.arange(cycle.INSTANTS // 2 + 1)
         if self.series is None:
             return np.array([np.ones(len(n)), np.where(n == 0, 0, 1j)])
@@ -54,7 +55,7 @@ class StrainFit(NamedTuple):
     law: LawFit
     storage: np.ndarray  # (n,) [Pa]
     loss: np.ndarray  # (n,) [Pa]
-    third: np.ndarray  # (n,) amplitude of the third harmonic of the torque, divided by that of the first
+    third: np.ndarray  # (n,) ratio of two amplitudes of the torque: third / first harmonic
 
 
 def memory_from(path: Path) -> Memory:
@@ -135,14 +136,14 @@ def fit_law(candidate: Candidate, sweep: StrainSweep, memory: Memory, plates: st
     law = assessed(own, _as_curves(sweep), found, scale, times, of_tests=False)
     best = found.u[int(np.nanargmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))]
     G, third = (np.asarray(v) for v in model(best))
-    # The residuals are those of magnitude and phase. The errors of the two moduli are those of G' and G''.
+    # The residuals above describe magnitude and phase. Here the errors of G' and G'' are computed.
     off = {"G'": G.real / sweep.storage - 1, "G''": G.imag / sweep.loss - 1}
     law = law._replace(curve_errors={name: float(np.sqrt(np.mean(v**2))) for name, v in off.items()})
     return StrainFit(law, G.real, G.imag, third)
 
 
 def with_loss_tangent(candidate: Candidate) -> Candidate:
-    """Return the candidate law with one more parameter, the loss tangent."""
+    """Return the candidate law with the loss tangent as an additional parameter."""
 
     def values(u: jax.Array, scale: object) -> jax.Array:
         return jnp.concatenate([candidate.values(u[:-1], scale), u[-1:]])
@@ -178,7 +179,7 @@ def said_of(sweep: StrainSweep, fits: Sequence[StrainFit]) -> list[str]:
     change, of_law = (_change_of_loss_tangent(own) for own in (sweep, best))
     names = [name for name in best.law.names if name != "loss_tangent"]
     shape = [n for n, unit in zip(best.law.names, best.law.units, strict=True) if unit == "1" and n in names]
-    shape = shape or names[1:]  # if all parameters are moduli, all except the first
+    shape = shape or names[1:]  # if all parameters are moduli: all parameters except the first
     if "loss_tangent" in best.law.names and shape:
         told.append(
             "without --model, the constant part of the stress is also computed with the modulus at the frequency of "
@@ -193,7 +194,7 @@ def said_of(sweep: StrainSweep, fits: Sequence[StrainFit]) -> list[str]:
         )
     ratio = (best.storage + 1j * best.loss) / (sweep.storage + 1j * sweep.loss)
     if np.sqrt(np.mean(np.abs(ratio - 1) ** 2)) > 0.05:
-        # Below a strain of 1, the phase of every law is nearly that of the series.
+        # Below a strain of 1, every law has nearly the phase of the series.
         of_phase = np.mean(np.angle(ratio) ** 2) > np.mean(np.log(np.abs(ratio)) ** 2)
         told.append(
             "the law does not describe this sweep, because it misses the moduli by more than 5 % on average: "

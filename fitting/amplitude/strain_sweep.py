@@ -12,8 +12,7 @@ from fitting.readers.units import RAW_TORQUE_UNITS
 from liverjax.core.errors import InputError
 
 FEWEST_POINTS, LARGEST_STRAIN, LARGEST_WITHOUT_UNIT = 4, 10.0, 2.0
-#: If a column has the unit % and its largest strain is at most this fraction (0.01, that is 1 %), its numbers may in
-#: fact be fractions.
+#: If a column has the unit % and its largest strain is at most 0.01 (1 %), its numbers may be fractions and not %.
 SMALLEST_LARGEST = 0.01
 #: If the temperature changes by more than this value [K], the table contains several sweeps.
 LARGEST_DRIFT = 2.0
@@ -34,14 +33,14 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
     """Read a strain sweep (frequency, storage modulus, loss modulus, strain amplitude) from a text file or workbook.
 
     Args:
-        path: path of the file. Its strain column is named strain_% or strain_1, or as the software of a rheometer names
-            it. A missing unit is taken as 1.
+        path: path of the file. The strain column has the name strain_% or strain_1, or the name that the software of a
+            rheometer writes. If the unit is missing, the unit is 1.
         table: name of the table, a part of its name, or its number (from 1), if the file has several tables.
         max_strain: maximum strain [1]; points with a larger strain are ignored. None: all points are used.
 
     Raises:
-        InputError: a column is missing; the moduli are tensile; a strain is too large; several frequencies or
-            temperatures; too few points.
+        InputError: a column is missing; the moduli are tensile; a strain is too large; the table has several
+            frequencies or temperatures, or too few points.
     """
     found = [t for t in tables_of(str(path), text_of(path, "a strain sweep").splitlines()) if "strain" in t.raw]
     if not found:
@@ -92,12 +91,13 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
 
 
 def _without_copied_rows(positive: np.ndarray, columns: list[np.ndarray], notes: list[str]) -> np.ndarray:
-    """Return `positive` (n,) without copies of rows (`without_multiples`), and add notes on the ignored rows.
+    """Return a mask (n,) of the used rows: positive rows that are not copies of other rows (`without_multiples`). Add
+    notes on the ignored rows.
 
     Args:
-        positive: whether the strain, the frequency and the moduli of a row are positive.
+        positive: mask (n,) of the rows with positive strain, frequency and moduli.
         columns: all columns (n,) of the table.
-        notes: notes, to which this function adds its own.
+        notes: list of notes. This function adds notes to it.
     """
     if not positive.all():
         notes.append(f"{(~positive).sum()} points without a positive strain, frequency or modulus are ignored")

@@ -1,1 +1,1 @@
-"""Fits of sweeps, curves, several tests, stiffness maps and parameters of scenes."""
+"""Fits of frequency sweeps, stress-stretch curves, several tests together, stiffness maps and parameters of scenes."""

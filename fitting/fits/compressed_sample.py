@@ -1,4 +1,4 @@
-"""Fit of a compressed sample: the parameters of the sample at rest, and the axial force."""
+"""Fit of a compressed sample: the parameters of the sample without compression, and the axial force."""
 
 import numpy as np
 
@@ -18,16 +18,15 @@ from liverjax.core.errors import InputError
 def of_compressed_sample(fit: Fit, sweep: Sweep, factors: compression.Shares) -> Fit:
     """Return the closed-form fit of a compressed sample, with the parameters of the sample at rest (not compressed).
 
-    Storage modulus, loss modulus and residuals of the fit still describe the compressed sample.
+    The storage modulus, the loss modulus and the residuals of the fit still describe the compressed sample.
 
     Args:
-        fit: fit of the measured moduli. If parameters of the model are moduli, these parameters are also divided by the
-            factors.
+        fit: fit of the measured moduli. All parameters of the model that are moduli are divided by the factors.
         sweep: the measured moduli.
-        factors: factors by which the compression changes the relaxing and the equilibrium moduli.
+        factors: factors of the relaxing and of the equilibrium moduli, caused by the compression.
 
     Raises:
-        InputError: the moduli are of tension or bending. The factors are only for torsion.
+        InputError: the moduli were measured in tension or bending. The factors are valid only for torsion.
     """
     if sweep.tensile:
         raise InputError(
@@ -55,8 +54,8 @@ def _of_parameters(fit: Fit, sweep: Sweep) -> list[str]:
 
 
 def _kind_at_rest(kind: Kind, factors: compression.Shares) -> Kind:
-    """Return the kind (the meaning of the variables u) for the sample at rest. The relaxing moduli and the equilibrium
-    modulus are divided by their factors."""
+    """Return the kind (`Kind`: the meaning of the variables u) for the sample at rest. The relaxing moduli and the
+    equilibrium modulus are divided by their factors."""
     seen, shown, moduli = kind.maxwell, kind.values, kind.moduli
     if shown is None or moduli is None:
         return kind._replace(maxwell=lambda u: weighed(seen(u), 1 / factors.relaxing, 1 / factors.equilibrium))
@@ -73,8 +72,9 @@ def _kind_at_rest(kind: Kind, factors: compression.Shares) -> Kind:
 
 
 def _of_own_moduli(kind: Kind, fit: Fit, sweep: Sweep) -> tuple[Kind, dict[str, object]]:
-    """Return the kind and the details with new Prony modes for the model of the sample at rest. The modes of the
-    measured moduli cannot be used, because each of these modes contains a relaxing and an equilibrium part."""
+    """Return the kind and the details with new Prony modes, which represent the model of the sample at rest. The Prony
+    modes of the measured moduli cannot be used, because each of these modes contains a relaxing and an equilibrium
+    part."""
     own, omega = kind.moduli, sweep.angular_frequency
     assert own is not None
     solid = kind.names[0] == "equilibrium_modulus"
@@ -85,9 +85,9 @@ def _of_own_moduli(kind: Kind, fit: Fit, sweep: Sweep) -> tuple[Kind, dict[str, 
 
 
 def compression_numbers(fit: Fit, simulation: simulated_rheometer.Simulation) -> dict[str, object]:
-    """Return the entry `precompression` of fit.json, for a fit in closed form or through the simulation. The forces
-    belong to the fitted model, not to its Prony modes. If its instantaneous modulus is infinite, the force at once is
-    None."""
+    """Return the entry `precompression` of fit.json, for a fit in closed form or with the simulated rheometer. The
+    forces are computed from the fitted model, not from its Prony modes. If the instantaneous modulus of the model is
+    infinite, the instantaneous force (`axial_force_at_once_N`) is None."""
     law, strain = laws.typical(simulation.law), simulation.precompression
     G, glued = float(np.asarray(law.shear_modulus())), fit.method != "closed-form"
     factors, kept = compression.shares(law, strain), compression.incompressible(law, strain)
@@ -113,8 +113,8 @@ def compression_numbers(fit: Fit, simulation: simulated_rheometer.Simulation) ->
 
 
 def _equilibrium_errors(fit: Fit) -> tuple[float | None, float | None]:
-    """Return the standard error and the total error [Pa] of the equilibrium modulus; None: unknown. The total error of
-    a fluid is the upper end of the 95 % interval, converted to a standard deviation."""
+    """Return the standard error and the total error [Pa] of the equilibrium modulus. An unknown error is None. The
+    total error of a fluid is the upper end of the 95 % interval, converted to a standard deviation."""
     total, interval = total_error.total_errors(fit).get("equilibrium_modulus"), fit.details.get(INTERVAL)
     if total is None or (interval and not np.isfinite(total)):
         return None, interval["high"] / NORMAL if interval else None

@@ -6,10 +6,10 @@ are independent with variance 1 in the prior. A Gauss-Newton method in a trust r
 (chi^2 + |z|^2)/2, where chi^2 is the sum of the squared residuals. J is the derivative of the residuals with respect to
 z. The Hessian I + J^T J is never assembled: each product of the Hessian with a vector needs one linearised run and one
 transposed run. No eigenvalue of this Hessian is below 1. The norm of the gradient is therefore an upper bound of the
-distance to the minimum, in standard deviations of the map. The prior's standard deviation of m sets the weight of the
-regularisation. This standard deviation is increased until chi^2 is as low as the number of measured components
-(discrepancy principle; Morozov 1966), or until chi^2 no longer falls. The uncertainty comes from the same Hessian.
-Lanczos iterations find the largest eigenvalues of J^T J (Bui-Thanh et al. 2013).
+distance to the minimum, in standard deviations of the map. The standard deviation of m in the prior sets the weight of
+the regularisation. This standard deviation is increased until chi^2 is at most the number of measured components
+(discrepancy principle; Morozov 1966), or until chi^2 no longer falls. The uncertainty is computed from the same
+Hessian: Lanczos iterations find the largest eigenvalues of J^T J (Bui-Thanh et al. 2013).
 """
 
 import re
@@ -36,9 +36,10 @@ from liverjax.core.versions import versions
 from liverjax.scenes.regions import set_by_regions
 from liverjax.scenes.scene import numbers_at
 
-#: Standard deviations of ln(modulus) to try: from a nearly uniform body to a body whose stiffness may vary strongly.
+#: Standard deviations of ln(modulus) in the prior, in the order in which they are tried. With the first, the body is
+#: nearly uniform. With the last, the stiffness may vary strongly.
 DEVIATIONS = (0.1, 0.2, 0.4, 0.8, 1.6)
-#: If the next larger standard deviation lowers chi^2 by less than this fraction, no larger one is tried.
+#: If a step to the next larger standard deviation lowers chi^2 by less than this fraction, the search ends.
 _WORTH = 0.02
 #: The search ends if the norm of the gradient is below this value. The norm is an upper bound of the distance to the
 #: minimum, in standard deviations of the map.
@@ -55,20 +56,20 @@ class Field(NamedTuple):
     modulus: np.ndarray  # modulus of the elements (E,); NaN in regions whose law has no such parameter
     sd: np.ndarray  # standard deviation (V,) of m at the nodes, from data and prior
     prior_sd: np.ndarray  # standard deviation (V,) of m at the nodes, from the prior alone
-    mesh_bias: np.ndarray | None  # error of m (V,) due to the meshes, to be subtracted from m; None: unknown
+    mesh_bias: np.ndarray | None  # error of m (V,) due to the meshes; m minus this error is better; None: unknown
     time_step_bias: np.ndarray | None  # error of m (V,) due to the time steps; None: unknown, or no time steps
     deviation: float  # standard deviation of m in the prior, chosen from `DEVIATIONS`
     length: float  # correlation length of the prior [m]
     chi2: float
     components: int  # number of measured displacement components
     reached: bool  # whether chi^2 is at most the number of components
-    distance: float  # distance to the minimum: length of the next Gauss-Newton step, in standard deviations
-    history: list[dict]  # one entry for each prior deviation, with the names in `_HISTORY`
+    distance: float  # distance to the minimum in standard deviations: length of the next Gauss-Newton step
+    history: list[dict]  # one entry for each standard deviation of the prior, with the names in `_HISTORY`
     eigenvalues: np.ndarray  # largest eigenvalues of J^T J; the data determine the directions of z with values > 1
     codes: tuple[int, ...]
     seconds: float
     given: np.ndarray  # (E,) True where a [[region]] of the scene, not the map, sets the modulus
-    level_sd: float  # standard deviation of a constant added to m, from the data alone, if the rest of m were known
+    level_sd: float  # standard deviation of a constant added to m, from the data alone, if m is otherwise known
 
 
 def start_of(problem: Problem, name: str) -> jax.Array:
@@ -102,24 +103,24 @@ def start_of(problem: Problem, name: str) -> jax.Array:
 
 
 def given_by_regions(problem: Problem, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return whether a [[region]] sets the parameter of each element (E,) in all scenes. Also return the values (E,)
-    that the regions of the first scene set; other values are NaN."""
+    """Return two arrays (E,) for the elements. The first is True where a [[region]] sets the parameter in all scenes.
+    The second contains the values that the regions of the first scene set; other values are NaN."""
     E = problem.scenes[0].mesh.number_of_elements
     each = [set_by_regions(scene.region, name, E) for scene in problem.scenes]
     return np.all([own for own, _ in each], axis=0), each[0][1]
 
 
 def values_at(problem: Problem, name: str, base: jax.Array, m: jax.Array) -> dict[str, jax.Array]:
-    """Return the values of the parameter `name` in the elements (E,) for the nodal field m (V,), as a dictionary with
-    the key `name`."""
+    """Compute the values (E,) of the parameter `name` in the elements from the nodal field m (V,). Return them as a
+    dictionary with the key `name`."""
     corners = m[problem.scenes[0].mesh.tetrahedra]
     return {name: base * jnp.exp(jnp.mean(corners, axis=1))}
 
 
 @partial(jax.jit, static_argnames="name")
 def _linearised(problem: Problem, base: jax.Array, m: jax.Array, name: str) -> Any:
-    """Return the n residuals (n,) of the runs for the field m, the linear map J from changes of m to changes of the
-    residuals, and the status codes of the runs."""
+    """Return three results of the runs for the field m: the n residuals (n,), the linear map J from changes of m to
+    changes of the residuals, and the status codes of the runs."""
     return jax.linearize(lambda m: misfit(problem, values_at(problem, name, base, m)), m, has_aux=True)
 
 
@@ -182,8 +183,7 @@ def _without_addresses(structure: object) -> str:
 
 
 class _Search:
-    """State of a search: the functions that the minimiser calls, and the file from which a stopped search can
-    continue."""
+    """State of a search, with the functions that the minimiser calls. A stopped search can continue from its file."""
 
     def __init__(
         self, problem: Problem, name: str, base: jax.Array, p: smooth.Prior, file: Path | None, progress: Callable
@@ -191,14 +191,14 @@ class _Search:
         self.problem, self.name, self.base, self.p, self.file, self.progress = problem, name, base, p, file, progress
         self.history: list[dict[str, float]] = []
         self.k, self.z = 0, np.zeros(len(p.root_mass))
-        self.last: list[_LinearRuns] = []  # runs at a trial field z, and at the field z before this trial step
+        self.last: list[_LinearRuns] = []  # runs at the present trial z, and at the z before this trial step
         self.evaluations = 0
         self.marks = {
             "name": name,
-            "length": float(p.scale),  # the prior's scale is a power of the length
+            "length": float(p.scale),  # the scale of the prior is a power of the correlation length
             "noise": mark_of(*(d.sd for d in problem.data)),
             "displacements": mark_of(*(a for d in problem.data for a in d._replace(sd=d.step))),
-            "search": "trust region",  # a search by another method may end at another map
+            "search": "trust region",  # a search with another method may end at another map
             "scene": mark_of(base, *jax.tree.leaves(problem.scenes)),
             "law or settings": mark_of(_without_addresses(jax.tree.structure(problem.scenes))),
             "versions": mark_of(str(versions())),
@@ -263,12 +263,12 @@ _HISTORY = ("deviation", "chi2_per_component", "iterations", "evaluations", "sec
 
 
 class MapOptions(NamedTuple):
-    """Options of the search for a map, and of the file that keeps its progress."""
+    """Options of the search for a map, and of the file with the progress of the search."""
 
     max_iterations: int = 60  # maximum number of iterations for each standard deviation of the prior
     modes: int = 60  # maximum number of eigenvectors of J^T J in the uncertainty
     file: Path | None = None  # HDF5 file with the progress, written after every iteration; None: no file
-    resume: bool = False  # continue the search in that file, if the file exists
+    resume: bool = False  # whether to continue the search in `file`, if this file exists
     #: Called after each iteration with the index of the standard deviation in `DEVIATIONS` and with chi^2 per
     #: component.
     progress: Callable[[int, float], None] = lambda weight, chi2: None
@@ -294,7 +294,7 @@ def estimate(
 
     Raises:
         InputError: the problem is invalid (see `start_of`), `file` belongs to another fit, or the simulation fails at
-            the parameters with which the search begins.
+            the starting parameters.
     """
     begin = time.perf_counter()
     base, problem = start_of(problem, name), with_solvers(problem, {})
@@ -338,8 +338,8 @@ def estimate(
 
 
 def _deviations_in_turn(search: _Search, max_iterations: int) -> None:
-    """Minimise the cost for larger and larger standard deviations of the prior, until chi^2 is as low as the number of
-    components or no longer falls. Each search begins at the result of the previous search."""
+    """Minimise the cost for larger and larger standard deviations of the prior. Stop when chi^2 is at most the number
+    of components, or when chi^2 no longer falls. Each search begins at the result of the previous search."""
     while True:
         # If the program was stopped after this search had finished, the history already has the entry of this search.
         # A search that stopped before its minimum, for example at its limit of iterations, continues.
@@ -377,18 +377,18 @@ def _minimised(search: _Search, max_iterations: int) -> dict[str, float]:
 
 def _measured_directions(here: _LinearRuns, n: int, modes: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the k largest eigenvalues (k,) of J^T J and their eigenvectors (n, k), for the n entries of z. k is
-    `modes`, or less if there are too few entries or residuals."""
+    `modes`, or smaller if z has too few entries or if there are too few residuals."""
     k = min(modes, n - 2, len(here.r))
     operator = scipy.sparse.linalg.LinearOperator((n, n), matvec=lambda z: here.pull(here.push(z)), dtype=float)
-    # The prior determines the directions with an eigenvalue far below 1, so a low accuracy of these eigenvalues is
-    # enough.
+    # The prior determines the directions with an eigenvalue far below 1. So these eigenvalues need only a low accuracy.
     values, vectors = scipy.sparse.linalg.eigsh(operator, k=k, ncv=min(n, 2 * k + 1), tol=1e-2, v0=np.ones(n))
     return np.maximum(values[::-1], 0.0), vectors[:, ::-1]
 
 
 def _by_hessian(here: _LinearRuns, g: np.ndarray, values: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """Return (I + J^T J)^-1 g (V,) for a vector g (V,), by conjugate gradients with a relative tolerance of 1 %. This
-    is accurate enough for first-order estimates. The eigenvalues and eigenvectors of J^T J give the preconditioner."""
+    is accurate enough for first-order estimates. The preconditioner is computed from the eigenvalues and eigenvectors
+    of J^T J."""
     n, shrink = len(g), values / (1 + values)
 
     def solved(z: np.ndarray) -> np.ndarray:
@@ -427,9 +427,9 @@ def distance_sentence(found: Field) -> str | None:
     )
 
 
-#: If the standard deviation of ln(modulus) exceeds this value at every mapped node, the data do not determine the level
-#: of the map. The same holds if the standard deviation of the level from the data alone exceeds this value. The second
-#: test is needed because the prior limits the standard deviation at the nodes.
+#: The data do not determine the level of the map in two cases: the standard deviation of ln(modulus) exceeds this value
+#: at every mapped node, or `level_sd` exceeds this value. The second test is needed because the prior limits the
+#: standard deviation at the nodes.
 OPEN = 0.5
 
 
@@ -449,8 +449,8 @@ def level_sentence(found: Field) -> str | None:
 
 
 def map_bias_sentences(found: Field) -> list[str]:
-    """Return at most two warnings: one about the mesh error, and one about the time step error. A warning is given only
-    if its error changes the map at some node by more than the standard deviation at this node."""
+    """Return at most two warnings: one about the mesh error, and one about the time step error. There is a warning
+    about an error only if the error changes the map at some node by more than the standard deviation at this node."""
     sources = (
         (found.mesh_bias, "mesh", "mesh_bias", "refine the mesh"),
         (found.time_step_bias, "time step", "time_step_bias", "use smaller time steps"),

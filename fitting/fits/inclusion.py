@@ -1,13 +1,13 @@
 """A stiff or soft sphere in a uniform body. Centre, radius and stiffness of the sphere are estimated from measured
 displacements.
 
-Unlike a stiffness map, the sphere has few parameters. A smooth map spreads a sharp edge, so the peak of the map is not
-the modulus of an inclusion. The map only gives the starting point of the fit. The edge of the sphere is smooth over a
+A sphere has fewer parameters than a stiffness map. A smooth map spreads a sharp edge, so the peak of the map is not the
+modulus of an inclusion. The map only gives the starting point of the fit. The edge of the sphere is smooth over a
 length proportional to the element size, so the residuals have derivatives with respect to the position of the sphere.
 An error of the radius can compensate an error of the modulus. The elements should therefore be quadratic, or much
 smaller than the sphere. An element that the edge cuts has the mean of both moduli, weighted by volume. The estimated
-error of the mesh contains the error of this mean, because the estimate uses richer elements, which resolve the edge
-better.
+mesh error contains the error of this mean, because the estimate uses smaller or quadratic elements, which resolve the
+edge better.
 """
 
 from functools import partial
@@ -25,9 +25,9 @@ from liverjax.core.struct import Number
 from liverjax.mesh.shape_functions import basis
 from liverjax.mesh.tetrahedra import TetMesh
 
-#: Points per edge of an element at which the sphere is evaluated.
+#: The sphere is evaluated at a grid of points in each element, with this number of points per edge.
 _POINTS = 5
-#: Width of the smooth edge of the sphere, divided by the distance between these points.
+#: Width of the smooth edge of the sphere, divided by the distance between the points of this grid.
 _EDGE = 0.15
 NAMES = ("centre.x", "centre.y", "centre.z", "radius", "background", "inclusion")
 
@@ -63,8 +63,8 @@ def fraction(mesh: TetMesh, centre: jax.Array, radius: Number) -> jax.Array:
 def start_from(problem: Problem, field: Field) -> np.ndarray:
     """Return the starting point u (6,) of the sphere (see `estimate`) from the map. The sphere consists of the elements
     whose ln(modulus) differs from the background by more than half of the largest difference. For this comparison, the
-    differences are divided by the standard deviation of the map. Without this division, the sphere could begin at large
-    differences in regions where the data contain little information, for example at corners.
+    differences are divided by the standard deviation of the map. Without this division, the starting sphere could lie
+    where the differences are large but the data contain little information, for example at corners.
 
     Raises:
         InputError: the map is uniform.
@@ -122,22 +122,22 @@ def estimate(problem: Problem, name: str, start: np.ndarray, **options: Any) -> 
         at_rest = jnp.mean(base)
         return jnp.stack([*u[:3], jnp.exp(u[3]), at_rest * jnp.exp(u[4]), at_rest * jnp.exp(u[4] + u[5])])
 
-    # A [[region]] sets the modulus of whole elements. If the mesh describes the loaded body, its points differ in the
-    # run. In both cases, the error at the edge of the sphere cannot be computed with `at_points`.
+    # A [[region]] sets the modulus of whole elements. If the mesh describes the loaded body, the points of the mesh
+    # change in the run. In both cases, `at_points` cannot be used to compute the error at the edge of the sphere.
     other = any(scene.region or scene.points_are == "loaded" for scene in problem.scenes)
     resolved = None if other else at_points
     unknowns = Unknowns(np.asarray(start) / np.asarray(scale), values_of, natural_of, NAMES, resolved)
     return fit(problem, unknowns, **options)[0]
 
 
-#: A sphere whose radius is below this number of element edges is represented too coarsely.
+#: If the radius of a sphere is below this number of element edges, the mesh is too coarse.
 SMALL = 1.5
 
 
 def size_sentence(mesh: TetMesh, found: Estimate) -> str | None:
-    """Return a warning if the sphere is as small as the elements, otherwise None. Each element has one modulus, so an
-    element at the edge of the sphere has a mean of both moduli. `mesh_bias` contains this error only to first order,
-    which is not accurate enough for so few elements."""
+    """Return a warning if the sphere is not much larger than the elements (`SMALL`), otherwise None. Each element has
+    one modulus, so an element at the edge of the sphere has a mean of both moduli. `mesh_bias` contains this error only
+    to first order, which is not accurate enough for so few elements."""
     radius, edge = float(found.values[3]), edge_length(mesh)
     if radius >= SMALL * edge:
         return None

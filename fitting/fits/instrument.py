@@ -1,13 +1,13 @@
 """Errors of the instrument that are common to all points of a fit (inertia, friction, gap), each with a prior.
 
-The instrument subtracts the torque of its inertia I; the modulus is the torque per angle, divided by the constant K of
-the geometry. If the true inertia is I (1 + delta), G' is too small by delta I omega^2 / K at the angular frequency
-omega. Without a prior, this term would compensate errors of the model. Here delta has a normal prior around 0 with the
-standard deviation `raw_torque.UNCERTAINTY`. delta is fitted only if the file contains the raw torque or the raw phase.
-The fitted delta is used only if it changes by at most two standard errors when the upper end of the band is left out.
-If this cannot be checked, the moduli are not corrected, and the standard errors contain the whole delta.
-The friction b of the bearing adds b omega / K to G''. The error of b has a normal prior around 0 with the standard
-deviation that the user gives.
+The instrument subtracts the torque of its inertia I from the measured torque. The modulus is the remaining torque per
+angle, divided by the constant K of the geometry. If the true inertia is I (1 + delta), G' is too small by delta I
+omega^2 / K at the angular frequency omega. Without a prior, delta would compensate errors of the model. Here delta has
+a normal prior around 0 with the standard deviation `raw_torque.UNCERTAINTY`. delta is fitted only if the file contains
+the raw torque or the raw phase. The fitted delta is used only if it changes by at most two standard errors when the
+upper end of the band is left out. If this change cannot be computed, the moduli are not corrected, and the standard
+errors contain the whole delta. The friction b of the bearing adds b omega / K to G''. The error of b has a normal prior
+around 0 with the standard deviation that the user gives.
 """
 
 import time
@@ -25,20 +25,20 @@ from fitting.readers import raw_torque
 from fitting.readers.frequency_sweep import Sweep, check_sweep, some
 from fitting.rigs import compression
 
-#: If the standard error of an instrument error, divided by its prior standard deviation, is at least this value, the
-#: data do not determine the instrument error.
+#: The standard error of an instrument error is divided by the standard deviation of its prior. If this ratio is at
+#: least this value, the data do not determine the instrument error.
 UNTOLD = 0.9
 #: ROUNDS: maximum number of rounds; each round is a fit and a correction. HALVINGS: maximum number of halvings of a
 #: correction that would make a modulus 0 or negative.
 ROUNDS, HALVINGS = 20, 30
-#: A correction below this many prior standard deviations counts as 0. This limit is needed for exact data, whose
-#: standard error is 0.
+#: A correction below this many standard deviations of the prior counts as 0. This limit is needed for data without
+#: noise, because their standard error is 0.
 SETTLED = 1e-6
 
 
 class Nuisance(NamedTuple):
-    """An error of the inertia or of the friction that the instrument subtracts. The size of the error is given in
-    standard deviations of its prior."""
+    """An error of the inertia or of the friction that the instrument subtracts. The unit of this error is the standard
+    deviation of its prior."""
 
     name: str
     moved: np.ndarray  # (n,) change of G* [Pa] at the n frequencies if the error is one standard deviation
@@ -57,8 +57,8 @@ class Nuisance(NamedTuple):
         return _cent(value) if self.name == "inertia" else f"{value:.2g} N m s"
 
     def compared(self, deviations: float) -> str:
-        """Return words for a warning. They state by how much the true friction or inertia is larger or smaller than the
-        value that the instrument subtracted."""
+        """Return words for a warning: by how much the true friction or inertia is larger or smaller than the value that
+        the instrument subtracted."""
         return (
             f"{self.told(abs(deviations))} {'larger' if deviations > 0 else 'smaller'} than the value that was "
             "subtracted"
@@ -90,7 +90,7 @@ class InstrumentErrors(NamedTuple):
 
 
 class Corrected(NamedTuple):
-    """Instrument errors that were fitted together with the modes: k errors, in standard deviations of their priors."""
+    """k instrument errors that were fitted together with the modes, in standard deviations of their priors."""
 
     values: np.ndarray  # (k,)
     covariance: np.ndarray  # (k, k)
@@ -99,12 +99,13 @@ class Corrected(NamedTuple):
 
     @property
     def criterion(self) -> float:
-        """The Bayesian information criterion of the fit, plus that of the prior of the instrument errors."""
+        """The Bayesian information criterion of the fit, plus the sum of the squares of the instrument errors (from
+        their priors)."""
         return viscoelastic.information_criterion(self.fit) + float(self.values @ self.values)
 
 
 def nuisances_of(sweep: Sweep) -> list[Nuisance]:
-    """Return the errors of the instrument (inertia, friction) for which the sweep has data."""
+    """Return the errors of the instrument (inertia, friction) that can be fitted with the data of the sweep."""
     out = []
     if sweep.inertia is not None:
         out.append(Nuisance("inertia", raw_torque.UNCERTAINTY * sweep.inertia + 0j, raw_torque.UNCERTAINTY))
@@ -114,9 +115,9 @@ def nuisances_of(sweep: Sweep) -> list[Nuisance]:
 
 
 def spectrum_before_correction(sweep: Sweep) -> generalised_maxwell.Spectrum:
-    """Return the spectrum on the dense grid. If the sweep has no data of the instrument, it is refused if no model
-    describes it. Otherwise it may seem impossible only because of an error of the instrument, so `refuse_impossible`
-    must follow after the correction."""
+    """Return the spectrum on the dense grid. A sweep without data of the instrument is refused if no model describes
+    it. A sweep with such data may seem impossible only because of an error of the instrument. So for this sweep,
+    `refuse_impossible` must be called after the correction."""
     if not nuisances_of(sweep):
         return generalised_maxwell.refuse_impossible(sweep)
     check_sweep(sweep)
@@ -128,11 +129,11 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep, factors: compression.Shares
 
     The fit and the sweep are returned unchanged if the sweep has no data of the instrument. For a model without free
     Prony modes, see `_of_rival_modes`. If one of the errors changes when the upper end of the band is left out, all
-    errors are reported, but the moduli are not corrected for them. If this cannot be checked, the moduli are not
+    errors are reported, but the moduli are not corrected. If this change cannot be computed, the moduli are not
     corrected either, but the standard errors contain the errors of the instrument. If the number of modes was chosen
     automatically, more modes are tried, too. If the modes were compared with other models, these models are fitted
     again to the corrected moduli. All these fits use Levenberg-Marquardt, also if the first fit used BFGS. `factors`:
-    as for `of_compressed_sample`, if the fit is that of a compressed sample.
+    see `of_compressed_sample`; only for a compressed sample.
     """
     begin, known = time.perf_counter(), nuisances_of(sweep)
     if not known:
@@ -168,10 +169,9 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep, factors: compression.Shares
 
 
 def _of_rival_modes(fit: Fit, sweep: Sweep, factors: compression.Shares | None) -> tuple[Fit, Sweep]:
-    """Return the fit of Prony modes and the sweep, both corrected for the instrument's errors, if these modes and
-    errors explain the sweep better than `fit`. Otherwise `fit` and the sweep are returned, and only the time of the
-    computation changes. `fit`: a model without free modes. A spectrum, for example, can fit the error of the inertia as
-    a part of the material.
+    """Fit Prony modes together with the instrument's errors. If they explain the sweep better than `fit`, return this
+    fit and the corrected sweep. Otherwise return `fit` with a new computing time, and the sweep. `fit`: a model without
+    free Prony modes. Such a model, for example a spectrum, can fit the error of the inertia as a part of the material.
     """
     modes = models.rival_modes(fit)
     if modes is None:
@@ -183,10 +183,10 @@ def _of_rival_modes(fit: Fit, sweep: Sweep, factors: compression.Shares | None) 
 
 
 def _with_more_modes(fit: Fit, sweep: Sweep) -> list[Corrected]:
-    """Return the instrument errors with more modes. The list is empty if the user gave the number of modes. The number
-    of modes of a fluid is always chosen.
+    """Return fits of the instrument errors with more modes than `fit`. The list is empty if the user gave the number of
+    modes. For a fluid, the program always chooses the number of modes.
 
-    If the inertia is wrong, a fit with enough modes may not converge, so too few modes are chosen at first.
+    If the inertia is wrong, a fit with enough modes may not converge. So the first fit may have too few modes.
     """
     if viscoelastic.TRIED not in fit.details and fit.kind.name != viscoelastic.FLUID.name:
         return []
@@ -196,11 +196,12 @@ def _with_more_modes(fit: Fit, sweep: Sweep) -> list[Corrected]:
 
 
 def _from_several_starts(fit: Fit, modes: int, sweep: Sweep) -> Corrected | None:
-    """Return the instrument errors with this number of modes of the kind of `fit`, or None if every fit failed.
+    """Return the instrument errors, fitted together with `modes` modes of the kind of `fit`, or None if every fit
+    failed.
 
-    If the search from 0 finds no fit whose modes the data determine, it is repeated from errors of one standard
-    deviation of the prior. A wrong inertia can make G' fall with the frequency; a mode with a time near 0 then takes
-    the place of the error.
+    The search begins at errors of 0. If it finds no fit whose modes the data determine, it begins again at errors of
+    plus and minus one standard deviation of the prior. A wrong inertia can make G' fall with the frequency. Then a mode
+    with a time near 0 may be fitted instead of the error.
     """
     known, found = nuisances_of(sweep), []
     for start in (0.0, 1.0, -1.0):
@@ -225,7 +226,7 @@ def _all_modes_determined(own: Corrected, sweep: Sweep) -> bool:
 
 
 def _in_both_bands(own: Corrected, sweep: Sweep) -> InstrumentErrors:
-    """Return the instrument errors, also without the last half decade of the sweep."""
+    """Return the instrument errors from the whole sweep, and from the sweep without its last half decade."""
     return InstrumentErrors(own.values, own.covariance, *_of_part(own.fit, sweep), own.found)
 
 
@@ -242,10 +243,9 @@ def _of_part(fit: Fit, sweep: Sweep) -> tuple[np.ndarray | None, np.ndarray | No
 
 
 def _beside_more_modes(fit: Fit, chosen: Fit, tried: list[Corrected], sweep: Sweep) -> Fit:
-    """Return the chosen fit with the table of tried numbers of modes, and with warnings about them.
-
-    The rows of fewer modes are those of the uncorrected moduli. Each other row belongs to the moduli that are corrected
-    by its own instrument errors.
+    """Return the chosen fit with the table of tried numbers of modes, and with warnings about these numbers. Rows with
+    fewer modes than `fit` belong to the uncorrected moduli. Each other row belongs to moduli that were corrected with
+    the instrument errors of this row.
     """
     known = nuisances_of(sweep)
     rows = [row for row in fit.details[viscoelastic.TRIED] if row["modes"] < fit.modes]
@@ -261,7 +261,8 @@ def _beside_more_modes(fit: Fit, chosen: Fit, tried: list[Corrected], sweep: Swe
 
 
 def _corrections(known: list[Nuisance], best: Corrected) -> list[str]:
-    """Return a note on each instrument error for which the moduli are corrected, or which the data do not determine."""
+    """Return a note on each instrument error: the moduli are corrected for this error, or the data do not determine
+    it."""
     return [
         f"the instrument's {n.name} is {n.compared(v)} (standard error {n.told(e)}, prior {n.told(1.0)}). The moduli "
         "are corrected for this error"
@@ -273,8 +274,8 @@ def _corrections(known: list[Nuisance], best: Corrected) -> list[str]:
 
 
 def used_errors(fit: Fit, sweep: Sweep) -> tuple[list[Nuisance], np.ndarray]:
-    """Return the k instrument errors that the standard errors of the fit contain, and their values (k,), for which the
-    sweep was corrected. The values are in standard deviations of the priors."""
+    """Return the k instrument errors that the standard errors of the fit contain, and their values (k,) in standard
+    deviations of the priors. The sweep was corrected for these values. They are 0 if the sweep was not corrected."""
     told, known = fit.details.get("instrument"), nuisances_of(sweep)
     if told is None or told["moves_with_the_band"]:
         return [], np.zeros(0)
@@ -285,8 +286,8 @@ def used_errors(fit: Fit, sweep: Sweep) -> tuple[list[Nuisance], np.ndarray]:
 
 def _not_corrected(errors: InstrumentErrors, known: list[Nuisance]) -> list[str]:
     """Return a warning for each instrument error that changes when the upper end of the band is left out, or one
-    warning if the errors were not found. If this change cannot be checked, each error above two standard errors has a
-    warning."""
+    warning if the errors were not found. If this change cannot be computed, there is a warning for each error of at
+    least two standard errors."""
     out, e = [], np.sqrt(np.diag(errors.covariance))
     if not errors.found:
         each = " and ".join(n.name for n in known)
@@ -371,7 +372,7 @@ def _errors_of_instrument(fit: Fit, sweep: Sweep, values: np.ndarray | None = No
         d = directions(here, known)
         own = d - J @ np.linalg.lstsq(J, d, rcond=1e-12)[0]  # the part of d that the modes cannot fit
         precision = own.T @ own / noise**2 + np.eye(len(known))
-        # The prior holds for the whole error, but the residuals contain only the part that is not corrected yet.
+        # The prior is valid for the whole error, but the residuals contain only the part that is not corrected yet.
         whole = np.linalg.solve(precision, own.T @ r / noise**2 - values)
         covariance = np.linalg.inv(precision)
         step = _halved_until_positive(sweep, known, values, whole)
@@ -389,10 +390,10 @@ def _fitted_again(fit: Fit, sweep: Sweep) -> Fit:
 
 
 def _halved_until_positive(sweep: Sweep, known: list[Nuisance], values: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Return the `step` of the corrections, halved until all moduli corrected by `values` + step are positive. Returns
-    zeros if `HALVINGS` halvings are not enough.
+    """Halve the `step` of the instrument errors until all moduli that are corrected by `values` + step are positive.
+    Return this step. Returns zeros if `HALVINGS` halvings are not enough.
 
-    The first step may be far too long, because the modes can fit a part of a large error.
+    The first step may be far too long if the modes fit a part of a large error.
     """
     for _ in range(HALVINGS):
         moved = _shifted(sweep, known, values + step)
@@ -403,8 +404,8 @@ def _halved_until_positive(sweep: Sweep, known: list[Nuisance], values: np.ndarr
 
 
 def _root_of(covariance: np.ndarray) -> np.ndarray:
-    """Return a square root A (k, k) of the covariance A A^T. Rounding can make an eigenvalue slightly negative; it then
-    counts as 0."""
+    """Return a matrix A (k, k) such that the covariance is A A^T. An eigenvalue that is slightly negative because of
+    rounding counts as 0."""
     sizes, vectors = np.linalg.eigh(covariance)
     return vectors * np.sqrt(np.maximum(sizes, 0.0))
 

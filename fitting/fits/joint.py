@@ -1,9 +1,9 @@
 """One set of Prony parameters, fitted to several tests together (sweep, creep, tension, indentation). Each test has its
-individual noise.
+own noise.
 
-The Levenberg-Marquardt method minimises the residuals of all tests together, each divided by its noise. A rig is a test
-machine with its sample. The simulation of a rig is differentiated in forward mode. The shear modulus of the law is
-scaled to G0, as in the torsion fit.
+The Levenberg-Marquardt method minimises the sum of the squared residuals of all tests. Each residual is divided by its
+noise. A rig is a test machine with its sample. The simulation of a rig is differentiated in forward mode. The shear
+modulus of the law is scaled to G0, as in the torsion fit.
 """
 
 import time
@@ -41,14 +41,14 @@ class Test(NamedTuple):
     predict: Callable[[Law, Prony, generalised_maxwell.Maxwell], tuple[jax.Array, jax.Array]]  # (n,), worst code
     measured: np.ndarray  # (n,)
     sd: np.ndarray  # (n,) standard deviation of the noise
-    #: Changes (n,) of the predicted values on an infinitely fine mesh, and with infinitely small time steps. None: the
-    #: test has no mesh and no time steps, or their errors are unknown.
+    #: Two changes (n,) of the predicted values: from the mesh to an infinitely fine mesh, and from the time steps to
+    #: infinitely small time steps. None: the test has no mesh and no time steps, or these changes are unknown.
     errors: Callable[[Law, Prony], tuple[jax.Array, np.ndarray]] | None = None
 
 
 def sweep(data: Sweep) -> Test:
-    """Return the test for a frequency sweep that is predicted in closed form. The noise comes from the file, or from
-    the misfit of the best Prony modes if the file gives no noise."""
+    """Return the test for a frequency sweep that is predicted in closed form. The noise is read from the file. If the
+    file states no noise, it is computed from the misfit of the best Prony modes."""
     check_sweep(data)
     omega = jnp.asarray(data.angular_frequency)
 
@@ -59,7 +59,7 @@ def sweep(data: Sweep) -> Test:
 
 
 def torsion_sweep(data: Sweep, rig: torsion.Rig, torque: Number, drive: torsion.Drive = torsion.Drive()) -> Test:
-    """Return the test for a frequency sweep that the torsion simulation predicts, at the torque amplitudes `torque` [N
+    """Return the test for a frequency sweep that the torsion simulation predicts, with the torque amplitude `torque` [N
     m]. `rig.free_height` states whether the height of the sample is free.
 
     The moduli are corrected for the mesh. The error of the time steps is computed for small strain. This error is
@@ -90,7 +90,8 @@ def _noise_of(data: Sweep) -> np.ndarray:
     if data.noise_given:
         return scales
     _, tried = viscoelastic.choose_modes(data, generalised_maxwell.refuse_impossible(data))
-    # Fits are also used if this sweep does not determine all their modes, because the other tests may determine them.
+    # This sweep may not determine all modes of a fit. Such a fit is used too, because the other tests may determine
+    # these modes.
     return scales * max(QUIETEST, min(fit.uncertainty.noise for fit in tried))
 
 
@@ -128,15 +129,15 @@ def fit(
     max_iterations: int = 30,
     progress: Callable[[int, float], None] = lambda iteration, cost: None,
 ) -> Estimate:
-    """Fit the Maxwell parameters (`uncertainty.parameter_names`) to all tests. Return them with standard errors.
+    """Fit the Maxwell parameters (`uncertainty.parameter_names`) to all tests. The result contains standard errors.
 
     If tests are simulated in rigs, `mesh_bias` and `time_step_bias` are the errors of each parameter due to meshes and
-    time steps. Subtract both to correct the parameter. A warning is given if one of them exceeds the standard error. If
-    the errors of a test are unknown (`Test.errors` is None), they count as 0.
+    time steps. Subtract both to correct the parameter. A warning is given if one of them exceeds the standard error. A
+    test with `Test.errors` = None counts as a test without these errors.
 
     Args:
         tests: one or more tests.
-        start: starting point of the parameters, which sets the number of modes.
+        start: starting values of the parameters. They also set the number of modes.
         law: one law for all tests. The fit scales its shear modulus to G0.
         part: which part of the stress relaxes, see `Prony`.
         max_iterations, progress: see `levenberg_marquardt_host`.
@@ -205,8 +206,8 @@ def _check_joint(tests: Sequence[Test], start: generalised_maxwell.Maxwell, law:
 
 
 def _missing(tests: Sequence[Test], material: tuple[Law, Prony]) -> tuple[np.ndarray, np.ndarray]:
-    """Return two errors of all n readings: those due to the meshes (n,), and those due to the time steps (n,). Both are
-    divided by the standard deviations of the noise of the readings."""
+    """Return two errors of all n readings: the errors due to the meshes (n,), and the errors due to the time steps
+    (n,). Both are divided by the standard deviations of the noise."""
     both = []
     for test in tests:
         none = np.zeros(len(test.measured))

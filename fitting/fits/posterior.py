@@ -1,13 +1,13 @@
 """Samples of the posterior of a fit, from the data and a stated prior.
 
-The likelihood is that of the fit: the errors are independent and normal, and their standard deviations are the given
-scales times a common factor s. If G' and G'' have noise of different size, the scales are changed accordingly. The
-factor s is integrated out, with the prior 1 / s. If the data have standard deviations, the prior is 1 / s for s > 1 and
-0 otherwise. So the standard deviations may be enlarged, but never reduced.
+The likelihood is the same as in the fit: the errors are independent and normal, and their standard deviations are the
+given scales times a common factor s. If G' and G'' have different relative noise, the scales are first adapted to this
+noise. The factor s is integrated out, with the prior 1 / s. If the data have standard deviations, the prior is 1 / s
+for s > 1 and 0 otherwise. So the standard deviations may be enlarged, but never reduced.
 
 If errors of the instrument are fitted together with the modes of a sweep, the posterior contains these errors too, with
-their priors. A sweep does not determine the gap. So the error of the gap is drawn independently, as one factor for all
-moduli of a draw.
+their priors. A sweep does not determine the gap. So the error of the gap is drawn independently of the data. It is one
+factor for all moduli of a draw.
 """
 
 import time
@@ -49,7 +49,8 @@ PRIORS = {
     "exponents are uniform between 0 and 1; if there are two exponents, every pair with the first at least as large as "
     "the second is equally probable",
 }
-#: Words of `PRIORS` -> words for a relaxation or creep test. Its prior is relative to the fitted G0 (`of_time_test`).
+#: Replacements of words in `PRIORS` for a relaxation or creep test. There, the prior of moduli is relative to the
+#: fitted G0 (`of_time_test`).
 _OF_TIME_TESTS = {
     "from the smallest measured modulus to 1000 times the largest": "from 0.01 to 1000 times the fitted G0",
     "within a factor of 1000 of the measured moduli": "from 1e-5 to 1000 times the fitted G0",
@@ -57,7 +58,7 @@ _OF_TIME_TESTS = {
 
 
 class Posterior(NamedTuple):
-    """Draws of K reported parameters: N draws from each of several chains."""
+    """Draws of K reported parameters from the posterior: N draws from each of several chains."""
 
     names: tuple[str, ...]
     draws: np.ndarray  # (chains, N, K)
@@ -65,7 +66,7 @@ class Posterior(NamedTuple):
     chains: Chains  # the same draws in the coordinates of the fit, with details of the sampling
     prior: str  # description of the prior in words
     seconds: float
-    simulated: dict[str, float] | None = None  # number of simulated draws, and largest error of their log density
+    simulated: dict[str, float] | None = None  # number of simulated draws, largest error of the log density
     times: tuple[float, float] | None = None  # shortest and longest time [s] in the prior of relaxation times
 
     def warnings(self) -> list[str]:
@@ -108,11 +109,11 @@ class Posterior(NamedTuple):
         return out
 
 
-#: NEAR: a draw lies near a bound of the prior if it is within this factor of the bound. CUT: the program warns if a
-#: larger fraction of the draws lies near a bound.
+#: NEAR: a draw lies near a bound of the prior if their ratio is below this factor. CUT: the program warns if the
+#: fraction of draws near a bound is larger than this value.
 NEAR, CUT = 1.25, 0.025
-#: AGREED: chains agree if R-hat is below this value. QUIETEST: lower bound of the relative error of data; if the data
-#: had no error, the posterior would be a single point.
+#: AGREED: chains agree if R-hat is below this value. QUIETEST: lower bound of the relative error of the data. Without
+#: this bound, the posterior of exact data would be a single point.
 AGREED, QUIETEST = 1.01, 1e-6
 
 
@@ -124,7 +125,7 @@ class Target(NamedTuple):
     prior: "Modes | Springpots | WithInstrument"
     deviations_given: bool
     weight: float = 1.0  # number of independent residuals, divided by the number of residuals
-    log_scales: float = 0.0  # half the log determinant of the covariance of the data for the common factor s = 1
+    log_scales: float = 0.0  # half the log determinant of the covariance of the data if s is 1
 
     def log_likelihood(self, u: np.ndarray) -> np.ndarray:
         """Return the log likelihood (W,) of W vectors u (W, P), up to a constant. The common factor s of the errors is
@@ -137,22 +138,23 @@ class Target(NamedTuple):
 
 def log_likelihood(square: np.ndarray, count: int, deviations_given: bool) -> np.ndarray:
     """Return the logarithm of the integral of s^-m exp(-square / (2 s^2)) ds / s over all s, up to a constant. Here s
-    is the common factor of the errors, and `square` is the sum of m = `count` squared residuals (at least m times
-    `QUIETEST`^2). If `deviations_given`, the integral is only over s >= 1."""
+    is the common factor of the errors, m = `count` is the number of residuals, and `square` is the sum of their squares
+    (at least m times `QUIETEST`^2). If `deviations_given`, the integral is only over s >= 1."""
     a, half = 0.5 * count, 0.5 * np.maximum(square, QUIETEST**2 * count)
     out = -a * np.log(half)
     return out + _log_gammainc(a, half) if deviations_given else out
 
 
-#: If the incomplete gamma function is below this value, its logarithm is computed from a series, because the function
-#: underflows to 0 at slightly smaller values.
+#: If the incomplete gamma function is below this value, its logarithm is computed from a series. At slightly smaller
+#: values, the function underflows to 0.
 _TINY = 1e-290
 
 
 def _log_gammainc(a: float, x: np.ndarray) -> np.ndarray:
-    """Return the logarithm of the regularised lower incomplete gamma function P(a, x), also where P underflows."""
+    """Return the logarithm of the regularised lower incomplete gamma function P(a, x). The result is finite even where
+    P underflows."""
     direct, low = scipy.special.gammainc(a, x), np.minimum(x, a)  # P underflows only where x is far below a
-    # P(a, x) = x^a exp(-x) / Gamma(a + 1) times the series 1 + x/(a + 1) + x^2/((a + 1)(a + 2)) + ...
+    # P(a, x) is x^a exp(-x) / Gamma(a + 1) times the series 1 + x/(a + 1) + x^2/((a + 1)(a + 2)) + ...
     series = np.log(scipy.special.hyp1f1(1.0, a + 1, low))
     series += a * np.log(low) - low - scipy.special.gammaln(a + 1)
     return np.where(direct > _TINY, np.log(np.maximum(direct, _TINY)), series)
@@ -203,8 +205,8 @@ class Modes(NamedTuple):
             log_time = np.log(model.relaxation_times)
             inside = (log_time[:, -1] > self.times[0]) & (log_time[:, 0] < self.times[1])
             inside &= (u[:, 0] > self.modulus[0]) & (u[:, 0] < self.modulus[1])
-            # Log determinants of two changes of variables: ratios to logits (softmax), and log times to the logs of
-            # their differences.
+            # Log Jacobian determinants of two changes of variables: from ratios to logits (softmax), and from log times
+            # to the logs of their differences.
             gaps = u[:, u.shape[-1] - model.ratios.shape[-1] + 1 :]
             found = np.log(shares).sum(axis=-1) + gaps.sum(axis=-1)
         return np.where(inside & np.isfinite(found), found, -np.inf)
@@ -212,7 +214,7 @@ class Modes(NamedTuple):
     def from_prior(self, rng: np.random.Generator, count: int, parameters: int) -> np.ndarray:
         """Draw u (count, parameters) from the prior."""
         modes = parameters // 2
-        # After division by their sum, these numbers are uniform on the simplex.
+        # The vector `share`, divided by the sum of its entries, is uniform on the simplex.
         share = rng.standard_exponential((count, modes + (not self.fluid)))
         log_time = -np.sort(-rng.uniform(*self.times, (count, modes)), axis=1)
         top = rng.uniform(*self.modulus, (count, 1))
@@ -236,8 +238,8 @@ class Modes(NamedTuple):
 
 class Springpots(NamedTuple):
     """Prior and parameters of a fractional model. The coordinates u are the free variables of the model (see
-    `fitting.methods.springpots`): logs of moduli, the logit of the larger exponent, and in models with two springpots
-    the logit of the ratio of both exponents."""
+    `fitting.methods.springpots`): logs of moduli, and the logit of the larger exponent. In models with two springpots,
+    one more variable is the logit of the ratio of both exponents."""
 
     model: Fractional
     moduli: tuple[float, float]  # bounds of the log moduli
@@ -251,8 +253,8 @@ class Springpots(NamedTuple):
 
     @property
     def _larger(self) -> np.ndarray:
-        """For each entry of u, 1 if it is the logit of the larger one of two exponents, otherwise 0. For a uniform
-        density of both exponents, the density of the larger exponent is proportional to this exponent."""
+        """For each entry of u: 1 if it is the logit of the larger exponent of two, otherwise 0. If both exponents have
+        a uniform density, the density of the larger exponent is proportional to this exponent."""
         return np.array([float(k == LARGER and len(self.model.free) - self._moduli.sum() > 1) for k in self.model.free])
 
     def log_prior(self, u: np.ndarray) -> np.ndarray:
@@ -278,8 +280,8 @@ class Springpots(NamedTuple):
 
 
 class WithInstrument(NamedTuple):
-    """Prior and parameters of Prony modes and of errors of the instrument. The last entries of u are these errors, in
-    standard deviations of their priors."""
+    """Prior and parameters of Prony modes and of errors of the instrument. The last entries of u are the errors of the
+    instrument, in standard deviations of their priors."""
 
     modes: Modes
     errors: list[Nuisance]
@@ -339,8 +341,8 @@ def sample(at: Target, parameters: int, count: int, seed: int = 0) -> Posterior:
 
 
 def _with_gap(found: Posterior, fit: Fit, seed: int) -> Posterior:
-    """Return the draws with the error of the gap, if the fit contains this error. The error of the gap multiplies all
-    moduli of a draw by one random factor. The factor is log-normal, so that no modulus is negative."""
+    """Add the error of the gap to the draws, if the fit contains this error. The error of the gap multiplies all moduli
+    of a draw by one random factor. The factor is log-normal, so that no modulus is negative."""
     relative, kind = fit.details.get("gap_error"), fit.kind
     if not relative:
         return found
@@ -390,7 +392,7 @@ def _beside_instrument(fit: Fit, sweep: Sweep, residuals: Callable[[np.ndarray],
 
 def _sweep_target(kind: Kind, sweep: Sweep, residuals: Callable[[np.ndarray], np.ndarray]) -> Target:
     size = np.hypot(sweep.storage, sweep.loss)
-    # The scales may come from the residuals of the fit (`with_weights_shown`), so they differ between fits.
+    # The scales may depend on the residuals of the fit (`with_weights_shown`), so they differ between fits.
     log_scales = float(np.sum(np.log(np.concatenate(sweep.deviations))))
     return target(kind, residuals, sweep.resolved, size, sweep.noise_given)._replace(log_scales=log_scales)
 
@@ -401,12 +403,13 @@ SIMULATED, DIFFERENT = 12, 0.1
 
 
 def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, seed: int = 0) -> Posterior:
-    """Sample the posterior of a fit of Prony modes through the torsion simulation.
+    """Sample the posterior of Prony modes that were fitted with the torsion simulation.
 
     The density is computed with the linear rig: the same test for small strain, which needs no time integration. For
-    each frequency, a complex factor corrects the linear rig so that it agrees with the simulation at the minimum. Some
-    draws are simulated in full. `Posterior.simulated` contains the largest difference between the simulated and the
-    approximate log likelihood of these draws. This difference shows how good the approximation is.
+    each frequency, the moduli of the linear rig are multiplied by a complex factor. With this factor, they agree with
+    the simulation at the minimum. A few draws are simulated in full. `Posterior.simulated` contains the largest
+    difference between the simulated and the approximate log likelihood of these draws. This difference shows how good
+    the approximation is.
     """
     sweep = alike_points.with_weights_shown(fit, sweep)
     data, scales = simulated_rheometer.simulation_data(sweep, simulation), np.concatenate(sweep.deviations)
@@ -433,7 +436,7 @@ def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, se
         partial(simulated_rheometer.with_jacobian, simulation=simulation, kind=fit.kind), modes[0], data, short=True
     )
     exact = np.stack([np.asarray(program(jax.numpy.asarray(u), data)[0]) for u in modes])
-    exact += own.residuals(some) - residuals(modes)  # adds the effect of the errors of the instrument
+    exact += own.residuals(some) - residuals(modes)  # add the effect of the errors of the instrument
     likelihood = own._replace(residuals=lambda _: exact).log_likelihood(some)
     apart = float(np.max(np.abs(likelihood - own.log_likelihood(some))))
     checked = {"draws": float(SIMULATED), "largest_difference": apart}
@@ -467,7 +470,7 @@ def of_time_test(fit: TimeFit, test: TimeTest, count: int, seed: int = 0) -> Pos
 
 
 def _of_time_test(words: str) -> str:
-    """Return the description of a prior whose moduli are relative to the fitted G0."""
+    """Return the description `words` of a prior, changed for moduli that are relative to the fitted G0."""
     for measured, fitted in _OF_TIME_TESTS.items():
         words = words.replace(measured, fitted)
     return words
@@ -475,11 +478,11 @@ def _of_time_test(words: str) -> str:
 
 def _beside_base_line(residuals: Callable, changes: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function from u (W, P) to uncorrelated residuals (W, m). The measured values contain common errors of
-    the base line, so their residuals are correlated, and the function transforms the residuals.
+    the base line, so their residuals are correlated. The function makes them uncorrelated.
 
-    The covariance of m residuals is s^2 (I + D^T D) with the noise s. `changes`: D (k, m), the change of all residuals
-    by one standard error of each of k independent errors, divided by s. The residuals are multiplied by
-    (I + D^T D)^(-1/2).
+    The covariance of m residuals is s^2 (I + D^T D) with the noise s. `changes`: D (k, m). Row j of D is the change of
+    all residuals due to one standard error of error j of k independent errors, divided by s. The residuals are
+    multiplied by (I + D^T D)^(-1/2).
     """
     if not len(changes):
         return lambda u: np.asarray(residuals(u))

@@ -5,8 +5,8 @@ Shear waves run along the axis of the sample, with the wave number k = omega sqr
 omega and the density rho. A rheometer divides the torque at the turning plate by the angle of this plate. So it
 measures G* k h cot(k h) instead of G*, for the sample height h (Schrag 1977, Trans. Soc. Rheol. 21, 399).
 
-In tension, the same formula holds for Young's modulus 3 G* of a slender sample. Its wave number is omega sqrt(rho/3G*).
-So the formula for G* is that of torsion with a third of the density.
+In tension, the same formula is valid for Young's modulus 3 G* of a slender sample, with the wave number omega
+sqrt(rho/3G*). So the formula for torsion, with a third of the density, gives the G* of tension.
 """
 
 import numpy as np
@@ -16,8 +16,8 @@ from fitting.readers.frequency_sweep import Sweep
 from liverjax.core.errors import InputError
 
 #: The inertia is subtracted only if |k h| is below this value, for the wave number k and the height h of the sample. At
-#: |k h| = pi/2, the sample alone is in resonance, and its measured storage modulus is 0. At pi, its measured modulus is
-#: infinite.
+#: |k h| = pi/2, the sample is in resonance, and its measured storage modulus is 0. At |k h| = pi, its measured modulus
+#: is infinite.
 MOST = 2.5
 #: If the inertia changes the modulus by more than this fraction, a note gives the change.
 WORTH_A_NOTE = 0.001
@@ -39,8 +39,8 @@ def shown(G: Array, omega: Array, density: float, height: float) -> Array:
 
 
 def rate_in_steps(omega: Array, steps: int) -> Array:
-    """Return the frequency (n,) [rad/s] that replaces omega in the inertia of a steady cycle, if Newmark's average
-    acceleration method computes the cycle in `steps` time steps."""
+    """Newmark's average acceleration method computes a steady cycle in `steps` time steps. Return the angular frequency
+    (n,) [rad/s] that replaces omega in the inertial forces of this cycle."""
     half = np.pi / steps
     return np.tan(half) / half * omega
 
@@ -64,7 +64,7 @@ def modulus_of(seen: np.ndarray, omega: np.ndarray, density: float, height: floa
 
 
 def _as_in_torsion(sweep: Sweep, density: float) -> float:
-    """Return the density with which the formulas of torsion give the inertia in the test of the sweep."""
+    """Return the density for the formulas of torsion: with it, they describe the inertia in the test of the sweep."""
     if sweep.load == "bending":
         raise InputError(
             f"{sweep.source or 'sweep'}: the moduli are of bending, where the inertia of the sample is not known: "
@@ -78,8 +78,8 @@ def taken_off(sweep: Sweep, density: float, height: float) -> Sweep:
     this function subtracts. A note gives the largest change.
 
     Raises:
-        InputError: at some frequency, no modulus can be computed, or G' or G'' without the inertia is not positive;
-            or the moduli are of bending.
+        InputError: at some frequency, no modulus can be computed, or G' or G'' without the inertia is not positive; or
+            the moduli were measured in bending.
     """
     seen = sweep.storage + 1j * sweep.loss
     G = modulus_of(seen, sweep.angular_frequency, _as_in_torsion(sweep, density), height)
@@ -102,8 +102,8 @@ def taken_off(sweep: Sweep, density: float, height: float) -> Sweep:
 
 
 def put_back(sweep: Sweep, density: float, height: float) -> Sweep:
-    """Return the sweep as the instrument measures it, with the effect of the inertia. This is the inverse of
-    `taken_off`, but it adds no note."""
+    """Return the sweep with the moduli that the instrument measures, which contain the effect of the inertia. This is
+    the inverse of `taken_off`, but it adds no note."""
     density = _as_in_torsion(sweep, density)
     seen = shown(sweep.storage + 1j * sweep.loss, sweep.angular_frequency, density, height)
     return sweep._replace(storage=seen.real, loss=seen.imag)

@@ -1,5 +1,5 @@
-"""Several samples of one material. Each sample is fitted separately, with the same model for all. Then the population
-of the samples is estimated."""
+"""Several samples of one material. Each sample is fitted separately, but with the same model. Then the population of
+the samples is estimated."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +20,7 @@ from liverjax.core.errors import InputError
 
 
 class Samples(NamedTuple):
-    """Fits of all samples with one model, and the population of each parameter of this model."""
+    """Fits of the same model to all samples, and the population of each parameter of this model."""
 
     sweeps: list[Sweep]  # corrected for the error of the instrument's inertia, if it was found
     fits: list[Fit]
@@ -44,7 +44,7 @@ class _Candidate(NamedTuple):
     label: dict
     fits: list[Fit]
     criterion: float  # sum of the information criteria of the samples
-    able: bool  # whether at least half of the samples determine all its parameters
+    able: bool  # whether at least half of the samples determine all parameters
 
 
 def fit(
@@ -99,8 +99,8 @@ def fit(
 
 
 def _without_error_of_instrument(fit: Fit, sweep: Sweep, dense: Spectrum) -> tuple[Fit, Sweep]:
-    """Return the fit with the results of further checks (`edges.honest`), and the sweep. Both are corrected for the
-    error of the instrument's inertia, if the sweep has data of the instrument and the model has free Prony modes."""
+    """Return the fit with the results of further checks (`edges.honest`), and the sweep. If the sweep has data of the
+    instrument and the model has free Prony modes, both are corrected for the error of the instrument's inertia."""
     fit, corrected = instrument.without_error_of_inertia(fit, sweep)
     if instrument.nuisances_of(sweep):
         dense = generalised_maxwell.refuse_impossible(corrected)
@@ -116,7 +116,7 @@ def _modes_for_all(
     sweeps: list[Sweep], dense: list[Spectrum], modes: int | str, progress: Callable
 ) -> list[_Candidate]:
     """Return the fits of all samples with 1, 2, … Prony modes. The search ends after an exact fit. It also ends after
-    two numbers of modes in a row that do not lower the summed criterion or that most samples do not determine."""
+    two failures in a row: the fits do not lower the summed criterion, or most samples do not determine the modes."""
     largest = min(generalised_maxwell.largest_number_of_modes(s) for s in sweeps)
     for s in sweeps:
         viscoelastic.check_modes(s, 1 if modes == "auto" else modes)
@@ -153,7 +153,7 @@ def _populations(fits: list[Fit]) -> dict[str, Population | None]:
     # The spectrum of the first sample may have no equilibrium modulus.
     for name in (*dict.fromkeys(n for row in known for n in row if "[" not in n), *names):
         pairs = np.array([row.get(name, (0.0, np.inf)) for row in known])
-        # The equilibrium modulus is the small rest of larger moduli, so its error hardly depends on its value.
+        # The equilibrium modulus is a small difference of larger moduli, so its error hardly depends on its value.
         found = population(pairs[:, 0], pairs[:, 1], additive=name == "equilibrium_modulus")
         if found is not None and (name.startswith("ratios[") or "exponent" in name):  # these cannot exceed 1
             of_mean, of_new = ((low, min(1.0, high)) for low, high in (found.mean_interval, found.new_interval))
@@ -165,8 +165,9 @@ def _populations(fits: list[Fit]) -> dict[str, Population | None]:
 #: _STRANGE: a sample is reported as an outlier if the probability that any of the samples differs so much by chance is
 #: below this value. _FEWEST: minimum number of samples for this test.
 _STRANGE, _FEWEST = 0.05, 4
-#: _APART: a sample is reported as an outlier only if its value, divided by the mean of the others, is above this ratio
-#: or below its inverse. _UNSURE: values whose logarithm has a larger standard error are not compared.
+#: _APART: a sample is reported as an outlier only if its value, divided by the mean of the other samples, is above this
+#: ratio or below the inverse of this ratio. _UNSURE: values whose logarithm has a larger standard error are not
+#: compared.
 _APART, _UNSURE = 1.3, 0.5
 #: If moduli of one material differ by this factor, their units may be wrong.
 _OTHER_UNIT = 100.0
@@ -177,8 +178,8 @@ def outliers(found: Samples) -> list[str]:
     correction). Half of the significance level is used for the first parameter, a modulus, because a wrong gap or
     radius multiplies all moduli by one factor. The other half is used for all other parameters together.
 
-    The strengths of a spectrum are not compared, because one strength may grow while its neighbour on the grid falls.
-    Instead, the first parameter is then |G*| in the middle of the common band.
+    The strengths of a spectrum are not compared, because one strength may be too large while its neighbour on the grid
+    is too small. For a spectrum, the first parameter is |G*| in the middle of the common band.
     """
     names = [n for n in found.populations if not n.startswith("strengths[")]
     compared = {n: np.array([found.values(k)[n] for k in range(len(found.fits))]) for n in names}
@@ -199,7 +200,7 @@ def outliers(found: Samples) -> list[str]:
             for chance, name, ratio, mean in own
         )
         what = "the units and sizes of this sample"
-        moduli = ("modulus", "springpot", "Hz")  # ends of the names of moduli; "Hz" belongs to `_middle_moduli`
+        moduli = ("modulus", "springpot", "Hz")  # endings of the names of moduli; "Hz" is for `_middle_moduli`
         if not any(name.endswith(moduli) for _, name, _, _ in own):
             what = "the temperature, the unit of the frequency, and the sample"
         source = Path(found.sweeps[sample].source).name
@@ -212,8 +213,9 @@ def outliers(found: Samples) -> list[str]:
 
 
 def _middle_moduli(found: Samples) -> dict[str, np.ndarray]:
-    """Return the fitted |G*| of the n samples in the middle of their common band, by name: (n, 2) with the values and
-    with the errors of single points. The result is empty if the samples have no common band."""
+    """Return the fitted |G*| of the n samples in the middle of their common band. The key is the name of this modulus.
+    The value is an array (n, 2): the moduli, and the typical error of a single point. The result is empty if the
+    samples have no common band."""
     low, high = (np.log([s.angular_frequency[end] for s in found.sweeps]) for end in (0, -1))
     if low.max() > high.min():
         return {}
@@ -232,9 +234,9 @@ def _known_logarithms(pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def _strangers(pairs: np.ndarray) -> list[tuple[int, float, float, float]]:
-    """Return the samples with a parameter that is far from that of the other samples. Each entry contains the index of
-    the sample, the probability of such a distance by chance in any of the samples, the ratio of the parameter to the
-    mean of the others, and this mean. `pairs` (n, 2): values and standard errors of the parameter.
+    """Return the samples whose parameter is far from the parameter of the other samples. Each entry contains the index
+    of the sample, the probability of such a distance by chance in any of the samples, the parameter divided by the mean
+    of the other samples, and this mean. `pairs` (n, 2): values and standard errors of the parameter.
     """
     known, logs, errors = _known_logarithms(pairs)
     out = []
@@ -250,7 +252,7 @@ def _strangers(pairs: np.ndarray) -> list[tuple[int, float, float, float]]:
 
 def _of_another_unit(logs: np.ndarray, sources: list[str], name: str) -> list[str]:
     """Return a warning if some samples have a modulus far above or below the modulus of the others. `logs`: logarithms
-    of the modulus `name`. This check also works for few samples, for which no statistical test is possible."""
+    of the modulus `name`. This check also works if there are too few samples for a statistical test."""
     order = np.argsort(logs)
     gaps = np.diff(logs[order])
     if not len(gaps) or gaps.max() < np.log(_OTHER_UNIT):
@@ -272,9 +274,9 @@ def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str,
     """Return the Prony modes of a typical sample, whose parameters are the means of the populations. Modes without a
     mean are not included. For other parameters without a mean, the median of the samples is used.
 
-    The equilibrium modulus of Prony modes is also the mean of the population (0 if no sample determines it): the mean
-    ratios are multiplied by one factor, because their sum alone would give another equilibrium modulus. This is not
-    done if a mode has no mean, or if only one sample determines the equilibrium modulus."""
+    The equilibrium modulus of Prony modes is also the mean of the population (0 if no sample determines it). The mean
+    ratios alone would give another equilibrium modulus, so they are multiplied by one factor. This is not done if a
+    mode has no mean, or if only one sample determines the equilibrium modulus."""
     kind, every = fits[0].kind, [values_of_sample(f) for f in fits]
     middle = {n: float(np.median([row.get(n, (0.0,))[0] for row in every])) for n in populations}
     mean = {name: p.mean for name, p in populations.items() if p is not None}

@@ -59,7 +59,7 @@ def check_data(problem: Problem) -> None:
 
 
 def misfit(problem: Problem, values: Mapping[str, object], store: str | int = "all") -> tuple[jax.Array, jax.Array]:
-    """Return the n residuals (n,) of all scenes for the parameters `values`, and the most severe status code of
+    """Simulate all scenes with the parameters `values`. Return the n residuals (n,), and the most severe status code of
     each scene. `store`: see `liverjax.simulate`."""
     parts, codes = [], []
     for scene, data in zip(problem.scenes, problem.data, strict=True):
@@ -70,8 +70,8 @@ def misfit(problem: Problem, values: Mapping[str, object], store: str | int = "a
 
 
 def with_solvers(problem: Problem, values: Mapping[str, object]) -> Problem:
-    """Return the problem with the linear solvers that its scenes need for these parameters. The solvers must be chosen
-    before compilation, because a compiled program does not know the values of the parameters when it is compiled.
+    """Return the problem with the linear solvers that its scenes need for the parameters `values`. The solvers must be
+    chosen before compilation, because the values of the parameters are unknown during compilation.
 
     Raises:
         InputError: the data name a step or a node that a scene does not have.
@@ -84,11 +84,11 @@ class Unknowns(NamedTuple):
     """The n unknowns u (n,) of the fit, and the functions that compute the parameters of the scenes from u."""
 
     start: np.ndarray  # starting point u (n,)
-    values_of: Callable[[jax.Array], Content]  # u -> parameters of the scenes by dotted name
-    natural_of: Callable[[jax.Array], jax.Array]  # u -> m parameters to report (m,)
+    values_of: Callable[[jax.Array], Content]  # u -> dictionary: dotted name -> parameter of the scenes
+    natural_of: Callable[[jax.Array], jax.Array]  # u -> m reported parameters (m,)
     names: Sequence[str]  # names of the reported parameters
     #: Function (u, richer mesh) -> parameters (E,) or (Q, E) of its E elements with Q integration points. It is needed
-    #: if the parameters vary within an element. The estimated error of the mesh then contains this variation.
+    #: if the parameters vary within an element. The estimated mesh error then contains the effect of this variation.
     at_points: Callable[[jax.Array, TetMesh], Content] | None = None
 
 
@@ -106,9 +106,9 @@ def fit(
         problem: scenes and data.
         unknowns: u, and the functions from u to the parameters of the scenes and to the reported parameters.
         max_iterations, progress: see `levenberg_marquardt_host`.
-        mesh_error: whether to estimate the errors due to the meshes and the time steps, and the change of each
-            parameter that they cause (`mesh_bias`, `time_step_bias`). A warning is given if a parameter changes by more
-            than its standard error. The estimate needs more runs, and one linear solve per step.
+        mesh_error: whether to estimate the errors due to the meshes and the time steps. These errors change each
+            parameter (`mesh_bias`, `time_step_bias`). A warning is given if the change is larger than the standard
+            error. The estimate needs more runs, and one linear solve per step.
     """
     begin, codes = time.perf_counter(), [0] * len(problem.scenes)
     start, values_of, natural_of, names, at_points = unknowns
@@ -133,7 +133,7 @@ def fit(
     seconds = time.perf_counter() - begin
     estimate = estimated(names, natural_of, found, problem.components)
     estimate = _of_alike_noise(problem, natural_of, found, estimate)
-    known = np.all(np.isfinite(estimate.standard_errors))  # an infinite error means that a parameter ran to a limit
+    known = np.all(np.isfinite(estimate.standard_errors))  # an infinite standard error: a parameter ran to a limit
     values = values_of(found.u)
     refused = _refused(problem, values) if known else None
     if refused is not None:
@@ -148,8 +148,8 @@ def fit(
 
 
 def _refused(problem: Problem, values: Content) -> str | None:
-    """Return a warning if a scene with the fitted parameters `values` is not allowed, otherwise None. The search does
-    not see this, because the parameters are unknown inside jit."""
+    """Return a warning if a scene with the fitted parameters `values` is not allowed, otherwise None. The search cannot
+    check this, because the values of the parameters are unknown inside jit."""
     try:
         for scene in problem.scenes:
             check_bounds(lj.with_parameters(scene, values))
@@ -175,15 +175,15 @@ def _of_discretisation(
 
 
 def _of_alike_noise(problem: Problem, natural_of: Callable, found: Solution, estimate: Estimate) -> Estimate:
-    """Return the estimate with larger standard errors, if the residuals show that the noise differs between components
-    or that the noise of neighbouring points is correlated. Correlated noise also causes a warning."""
+    """Return the estimate. Its standard errors are larger if the residuals show one of two facts: the noise differs
+    between components, or the noise of neighbouring points is correlated. Correlated noise also causes a warning."""
     if not np.all(np.isfinite(estimate.standard_errors)):
         return estimate
     r, J = np.asarray(found.residuals), np.asarray(found.jacobian)
     seen = np.concatenate([np.isfinite(d.sd).ravel() for d in problem.data])
     slope = np.asarray(jax.jacfwd(natural_of)(jnp.asarray(found.u)))
-    # The noise of some components may be larger than stated, for example in the direction of the depth or where the
-    # motion is large.
+    # The noise of some components may be larger than stated, for example in the depth direction or where the motion is
+    # large.
     uneven = np.linalg.norm(uneven_root(J[seen], r[seen], slope), axis=1)
     if _many(J, seen):
         larger = np.maximum(uneven / estimate.standard_errors, 1.0)
@@ -209,13 +209,13 @@ def _of_alike_noise(problem: Problem, natural_of: Callable, found: Solution, est
     return estimate._replace(root=root, standard_errors=errors, correlation=correlation, warnings=told)
 
 
-#: If there are at least this many measured components per parameter, the residuals show whether the noise differs
-#: between components.
+#: The residuals show whether the noise differs between components only if there are at least this many measured
+#: components per parameter.
 _MANY = 20
 
 
 def _many(J: np.ndarray, seen: np.ndarray) -> bool:
-    """Return whether there are enough residuals to find out if the noise differs between components."""
+    """Return whether there are enough residuals (`_MANY`) to test whether the noise differs between components."""
     return bool(np.count_nonzero(seen) >= _MANY * J.shape[1])
 
 
@@ -233,7 +233,7 @@ def _places_and_groups(problem: Problem, seen: np.ndarray) -> tuple[np.ndarray, 
 
 
 class Discretisation(NamedTuple):
-    """Errors of the n residuals that the meshes and the time steps cause."""
+    """Errors of the n residuals due to the meshes and due to the time steps."""
 
     mesh: np.ndarray | None  # (n,); None: unknown
     time_step: np.ndarray | None  # (n,); None: unknown, or no scene has time steps
@@ -263,7 +263,7 @@ def _errors_in(scene: Scene, data: Displacements, finer: Finer | None) -> tuple[
     errors are NaN. If the mesh error is unknown, the function warns."""
     readings = partial(_all_differences, data, scene)
     try:
-        refuse(scene)  # `prepared` replaces a loaded mesh, so this check must come before it
+        refuse(scene)  # this check must come before `prepared`, which replaces a loaded mesh
         run = lj.simulate(scene, mesh_error=finer is None)
         error = run.mesh_error
         if error is None:
@@ -289,12 +289,12 @@ def _all_differences(data: Displacements, scene: Scene, result: lj.Result) -> ja
 
 
 def with_discretisation_as_noise(problem: Problem) -> tuple[Problem, list[dict[str, float]]]:
-    """Return the problem with larger noise, which contains the errors of the meshes and the time steps. Also return,
-    for each scene, the sizes of these errors, divided by the stated noise [1]. The keys are those of `Discretisation`;
-    unknown errors are not included.
+    """Add the errors of the meshes and the time steps to the noise of the problem. Also return, for each scene, the
+    sizes of these errors, divided by the stated noise [1]. The keys are the fields of `Discretisation`; unknown errors
+    are not included.
 
     A size is a root mean square over the measured components, for the parameters in the scenes. Without the added
-    noise, a map would compensate these errors by a false stiffness. If an error cannot be estimated, a warning is
+    noise, a wrong stiffness in a map would compensate these errors. If an error cannot be estimated, a warning is
     given, and this error is not added.
     """
     errors = {kind: e for kind, e in discretisation_errors(problem, {})._asdict().items() if e is not None}
@@ -307,8 +307,8 @@ def with_discretisation_as_noise(problem: Problem) -> tuple[Problem, list[dict[s
     return problem._replace(data=tuple(data)), sizes
 
 
-#: If a parameter with an upper bound begins nearer to the bound than this fraction of it, the search begins at this
-#: distance. At the bound itself, the derivative of the parametrisation is 0.
+#: The search begins at a distance of at least this fraction of the upper bound from this bound. At the bound itself,
+#: the derivative of the parametrisation is 0.
 _FROM_BOUND = 0.02
 
 
@@ -319,8 +319,9 @@ def _upper_bound(scene: Scene, name: str) -> float:
 
 
 def _in_bounds(starts: np.ndarray, upper: np.ndarray) -> Callable[[jax.Array], jax.Array]:
-    """Return the function from the unknowns u (n,) to the parameters (n,), which are `starts` (n,) for u = 0. Positive
-    parameters stay positive and below their bounds `upper` (n,), which are infinite if there are none."""
+    """Return the function from the unknowns u (n,) to the parameters (n,). For u = 0, the parameters are `starts` (n,),
+    but not closer to a bound than `_FROM_BOUND`. Positive parameters stay positive and do not exceed their bounds
+    `upper` (n,). A parameter without a bound has the bound infinity."""
     positive, bounded = starts > 0, (starts > 0) & np.isfinite(upper)
     top = np.where(bounded, upper, 1.0)
     begin = np.sqrt(np.maximum(np.log(top / np.where(bounded, starts, 1.0)), _FROM_BOUND))
@@ -338,7 +339,7 @@ _AT_BOUND = 0.01
 
 
 def _told_of_bounds(found: Estimate, upper: np.ndarray) -> Estimate:
-    """Return the estimate. If a parameter is at its bound in `upper` (n,), a warning is given and added."""
+    """Return the estimate. If a parameter is at its bound in `upper` (n,), warn and add the warning to the estimate."""
     if not np.isfinite(upper).any():
         return found
     errors = np.where(np.isfinite(found.standard_errors), found.standard_errors, 0.0)

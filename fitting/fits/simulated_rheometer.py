@@ -1,7 +1,7 @@
-"""Identify a generalised Maxwell model through the simulated rheometer: the torsion of a sample between its plates.
+"""Identify a generalised Maxwell model with a simulated rheometer: the torsion of a sample between two plates.
 
-The recursion is the update of the history variables of the viscosity in each time step. The rig is the machine with its
-sample. The linear rig is the same test for small strain, whose moduli are known without a mesh.
+The recursion is the update of the history variables of the viscosity in each time step. The rig is the rheometer with
+the sample. The linear rig is the same test for small strain, whose moduli are known without a mesh.
 """
 
 import time
@@ -56,19 +56,19 @@ class Simulation(NamedTuple):
     steps: int = 50
     cell_size: float | None = None
     strain: float = 1e-3  # amplitude at the rim (section 5.2)
-    density: float | None = None  # of the sample [kg/m^3]; None: the moduli contain no inertia
-    precompression: float = 0.0  # compression by the plates, divided by the height at rest (`compression`)
-    tensile: bool = False  # whether the data are of tension (`Sweep.tensile`)
+    density: float | None = None  # density of the sample [kg/m^3]; None: the moduli contain no inertia
+    precompression: float = 0.0  # decrease of the height, divided by the height at rest (`compression`)
+    tensile: bool = False  # whether the data were measured in tension (`Sweep.tensile`)
 
     @property
     def is_linear(self) -> bool:
-        """Whether the moduli without the error of a mesh are known. They are known for small strain, except for a
-        compressed sample with inertia."""
+        """Whether the moduli are also known without a mesh. This is true for small strain, except for a compressed
+        sample with inertia."""
         return self.strain <= LINEAR_STRAIN and not (self.density is not None and self.precompression)
 
     @property
     def inertia(self) -> tuple[float, float] | None:
-        """Density [kg/m^3] and height [m] for `sample_inertia`; None if the instrument has subtracted the inertia."""
+        """Density [kg/m^3] and height [m] for `sample_inertia`. None: the measured moduli contain no inertia."""
         if self.density is None:
             return None
         density = compression.torsional_density(laws.typical(self.law), self.precompression, self.density)
@@ -76,9 +76,9 @@ class Simulation(NamedTuple):
 
     @property
     def run(self) -> "Simulation":
-        """The settings of the simulation that is fitted to the data. For a compressed sample, the error of the mesh is
-        known only for a simulation without inertia. So the inertia is subtracted from the data instead. The same is
-        done for data of tension, because their inertia is not that of torsion."""
+        """The settings of the simulation that is fitted to the data. For a compressed sample, the mesh error is known
+        only without inertia. So the simulation has no inertia, and the inertia is subtracted from the data. The same is
+        done for data of tension, because tension and torsion have different inertial forces."""
         return self._replace(density=None) if self.precompression or self.tensile else self
 
 
@@ -89,8 +89,8 @@ LINEAR_STRAIN = 1e-2
 
 
 def law_and_prony(model: Maxwell, law: laws.Law, simulation: Simulation) -> tuple[laws.Law, Prony]:
-    """Return the material of the sample from Prony modes: the law, whose shear modulus is scaled to the G0 of the
-    modes, and the viscosity."""
+    """Return the material of the sample for given Prony modes: the law, scaled to the G0 of the modes, and the
+    viscosity."""
     viscosity = Prony(
         ratios=model.ratios,
         relaxation_times=model.relaxation_times,
@@ -108,7 +108,7 @@ def simulated_residuals(
     u: jax.Array, data: tuple, simulation: Simulation, kind: Kind = Kind()
 ) -> tuple[jax.Array, torsion.Moduli]:
     """Return the residuals and the simulated moduli. The residuals (2n,) are simulated minus measured moduli, divided
-    by their standard deviations. The residuals of a prior follow, if `kind` has one.
+    by their standard deviations. If `kind` has a prior, the residuals of the prior follow.
 
     Args:
         u: variables of `kind`.
@@ -126,12 +126,12 @@ def simulated_residuals(
 def with_jacobian(
     u: jax.Array, data: tuple, simulation: Simulation, kind: Kind = Kind()
 ) -> tuple[jax.Array, jax.Array, torsion.Moduli]:
-    """Return the residuals of `simulated_residuals`, their derivatives (m, P) with respect to the P variables u, with
-    one row for each of the m residuals, and the simulated moduli.
+    """Return the m residuals of `simulated_residuals`, their derivatives (m, P) with respect to the P variables u, and
+    the simulated moduli.
 
-    The derivatives are those of the linear rig. If the strain is large, or if a compressed sample has inertia, the
-    simulation is differentiated instead. With the derivatives of the linear rig, Gauss-Newton finds the same minimum in
-    a small fraction of the time (experiments/benchmarks/torsion_speed.py).
+    The derivatives are computed with the linear rig. If the strain is large, or if a compressed sample has inertia, the
+    simulation is differentiated instead. With the linear rig, Gauss-Newton finds the same minimum in a small fraction
+    of the time (experiments/benchmarks/torsion_speed.py).
     """
     if not simulation.is_linear:
 
@@ -155,7 +155,7 @@ def small_strain_moduli(
     rig: torsion.Rig, model: Maxwell, law: laws.Law, omega: jax.Array, simulation: Simulation
 ) -> jax.Array:
     """Return the complex moduli (n,) [Pa] of the linear rig at n frequencies. For small strain, the moduli of the
-    simulation approach these moduli, except for the error of the mesh."""
+    simulation approach these moduli, except for the mesh error."""
     scaled, prony = law_and_prony(model, law, simulation)
     if simulation.precompression:
         scale = model.shear_modulus / law.shear_modulus()
@@ -167,7 +167,8 @@ def small_strain_moduli(
 
 
 def rig_of(simulation: Simulation) -> torsion.Rig:
-    """Return the rig of a simulation. If the error of the mesh is known exactly, a coarse mesh is used."""
+    """Return the rig of a simulation. Without a given element size, a coarse mesh is used for small strain without
+    inertia: there, the mesh error is known exactly."""
     cell, height = simulation.cell_size, simulation.height
     if cell is None and simulation.density is None and simulation.strain <= LINEAR_STRAIN:
         cell = torsion.linear_cell_for(simulation.radius, height)
@@ -187,8 +188,9 @@ def rig_of(simulation: Simulation) -> torsion.Rig:
 
 @cache
 def _without_mesh(radius: float, gap: float, law: str, strain: float) -> tuple[Glued, Glued]:
-    """Return the factors and the force of a sample that is compressed between glued plates, and their estimated mesh
-    errors (see `glued_compression.glued`). `law`: name of the law. A fit needs this result twice, so it is cached."""
+    """Return the factors and the force of a sample that is compressed between glued plates, and the estimated mesh
+    errors of these numbers (see `glued_compression.glued`). `law`: name of the law. A fit needs this result twice, so
+    it is cached."""
     return glued(radius, gap, laws.typical(law), strain)
 
 
@@ -197,7 +199,7 @@ def simulation_data(sweep: Sweep, simulation: Simulation) -> tuple:
     standard deviations.
 
     Raises:
-        InputError: scheme or part of the simulation is unknown, or the law has no such part.
+        InputError: `scheme` or `part` of the simulation is unknown, or the law does not have this part.
     """
     from liverjax.physics.viscosity import check_viscosity
 
@@ -208,8 +210,8 @@ def simulation_data(sweep: Sweep, simulation: Simulation) -> tuple:
     return rig, law, jnp.asarray(sweep.angular_frequency), torque, measured, scales
 
 
-#: Results of the closed-form fit that stay valid for the fit through the simulation. OF_THE_DATA: words that identify
-#: the warnings that stay valid. KEPT: keys of the details that stay valid.
+#: Results of the closed-form fit that are also valid for the fit with the simulation. OF_THE_DATA: words in the
+#: warnings that are also valid. KEPT: keys of the details that are also valid.
 OF_THE_DATA = (
     "modes would follow",
     "about as well as",
@@ -241,8 +243,8 @@ KEPT = (
 
 
 def _as_simulated(sweep: Sweep, simulation: Simulation) -> tuple[Sweep, Simulation]:
-    """Return the sweep and the settings with which it is simulated. The inertia in data of tension is not that of
-    torsion. So this inertia is subtracted from the data, and the simulation has none."""
+    """Return the sweep and the settings of its simulation. Tension and torsion have different inertial forces. So for
+    data of tension, the inertia is subtracted from the data, and the simulation has no inertia."""
     if simulation.inertia is None or not sweep.tensile:
         return sweep, simulation
     return sample_inertia.taken_off(sweep, *simulation.inertia), simulation._replace(tensile=True).run
@@ -255,7 +257,7 @@ def through_torsion(
     optimizer: str = OPTIMIZERS[0],
     progress: Callable[[int, float], None] = lambda iteration, cost: None,
 ) -> Fit:
-    """Fit the moduli that the simulated rheometer measures to the data. The search begins at the closed-form fit.
+    """Fit the moduli of the simulated rheometer to the measured moduli. The search begins at the closed-form fit.
 
     Args:
         sweep: data. They contain the inertia of the sample if `simulation` has a density.
@@ -268,7 +270,7 @@ def through_torsion(
     begin = time.perf_counter()
     sweep, simulation = _as_simulated(sweep, simulation)
     data = simulation_data(sweep, simulation)
-    # Nearly all of the time for the compression is compilation.
+    # The time for the compression counts as compile time, because nearly all of it is compilation.
     pressing = time.perf_counter() - begin if simulation.precompression else 0.0
     rig, law, *_, scales = data
     u0, kind = jnp.asarray(start.solution.u), start.kind
@@ -292,7 +294,7 @@ def through_torsion(
             return found, simulated_residuals(found.u, data, simulation, kind)[1]
 
         (found, m), compiling, running = timed(minimised, u0, *data)
-    if isinstance(start.solution.u, np.ndarray):  # all later steps use NumPy, as the closed form does
+    if isinstance(start.solution.u, np.ndarray):  # then all later steps use NumPy too
         found = Solution(*(np.asarray(field) for field in found))
     storage, loss = np.asarray(m.storage), np.asarray(m.loss)
     worst = int(status.most_severe(m.statistics.status))
@@ -310,8 +312,8 @@ def through_torsion(
 
 
 def _as_told_before(fit: Fit, start: Fit) -> Fit:
-    """Add to the simulated fit the errors of the gap and of the instrument, taken from the closed-form fit `start`.
-    Warnings and details of `start` are added too if they concern the data."""
+    """Add the errors of the gap and of the instrument to the simulated fit. They are taken from the closed-form fit
+    `start`. Warnings and details of `start` are added too if they concern the data."""
     more = tuple(w for w in start.warnings if any(words in w for words in OF_THE_DATA))
     of_the_model = {k: v for k, v in start.details.items() if k in KEPT}
     fit = _with_shared_errors(fit._replace(details=fit.details | of_the_model), start)
@@ -330,9 +332,9 @@ def _with_shared_errors(fit: Fit, start: Fit) -> Fit:
 def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Fit:
     """Return the fit with the changes of the parameters due to the mesh and due to the time steps, to first order.
 
-    At small strain, both changes follow from two sets of moduli without the error of a mesh: one for the recursion, and
+    At small strain, both changes are computed from two sets of moduli without mesh error: one for the recursion, and
     one for continuous time. For a compressed sample, these moduli are computed with quadratic elements, and an estimate
-    of their remaining error is added (`glued_compression`).
+    of the remaining mesh error is added (`glued_compression`).
     """
     rig, law, omega, scales = data
     scaled, prony = law_and_prony(fit.kind.maxwell(fit.solution.u), law, simulation)
@@ -369,7 +371,7 @@ def _of_held(
     rig: torsion.Rig, material: tuple[laws.Law, Prony], omega: jax.Array, simulation: Simulation
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the complex moduli (n,) [Pa] of a compressed sample at n frequencies, for the recursion and for continuous
-    time. Both are corrected by the estimated error of the meshes in `_without_mesh`.
+    time. Both are corrected for the mesh error that `_without_mesh` estimates.
     """
     law, prony = material
     of, moduli = jax.jit(torsion.held)(rig, law), jax.jit(torsion.held_moduli, static_argnums=4)
@@ -410,8 +412,8 @@ def _simulation_details(
 
 
 def largest_shift(closed: Fit, simulated: Fit) -> float:
-    """Return the largest change of a parameter or of the equilibrium modulus from the closed form to the simulation,
-    divided by the standard error."""
+    """Return the largest difference between closed form and simulation, of all parameters and the equilibrium modulus.
+    Each difference is divided by the standard error."""
     (before, _), (after, errors) = (_with_equilibrium(fit) for fit in (closed, simulated))
     shift = np.abs(after - before)
     known = np.isfinite(errors) & (shift > 1e-6 * np.abs(before))
@@ -419,14 +421,14 @@ def largest_shift(closed: Fit, simulated: Fit) -> float:
 
 
 def _seen_by_user(fit: Fit) -> Estimate:
-    """Return the parameters in which the simulation is compared with the closed form: those of a springpot model, or
-    those of the Prony modes."""
+    """Return the parameters that are compared between simulation and closed form: of a springpot model, or of the Prony
+    modes."""
     return fit.uncertainty if fit.parameters is None or fit.kind.effective is not None else fit.parameters
 
 
 def _with_equilibrium(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """Return the parameters of a springpot model, or the parameters of the modes followed by the equilibrium modulus,
-    and the standard errors of all of these."""
+    """Return two arrays: parameters and their standard errors. The parameters belong to a springpot model or to Prony
+    modes. For Prony modes, the last entry is the equilibrium modulus."""
     u = _seen_by_user(fit)
     if u is not fit.uncertainty:
         return u.values, u.standard_errors
@@ -452,7 +454,7 @@ def _bias(closed: Fit, simulated: Fit) -> list[str]:
 def _cause(closed: Fit, simulated: Fit, k: int) -> tuple[str, str]:
     """Return two parts of a warning about the change of parameter k: the cause with a verb ("… changes"), and the
     remedy."""
-    # In this case, the simulation contains the inertia of the sample, but the closed form does not.
+    # The simulation contains the inertia of the sample, but the closed form does not.
     if simulated.details.get("density_kg_m3") and not closed.details.get("density_kg_m3"):
         return (
             "the sample's inertia and the discretisation change",

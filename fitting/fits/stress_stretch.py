@@ -1,5 +1,5 @@
-"""Hyperelastic laws, fitted to stress-stretch curves by least squares from many starting points. A stress of the
-law that falls within the range of the data adds a penalty to the residuals."""
+"""Hyperelastic laws, fitted to stress-stretch curves by least squares from many starting points. If the stress of the
+law decreases while the sample is deformed further, a penalty is added to the residuals."""
 
 import time
 from typing import NamedTuple
@@ -25,7 +25,8 @@ from liverjax.laws import Law, homogeneous
 from liverjax.laws.stability_check import ellipticity
 
 STARTS = 128
-#: Weight of a falling stress in the residuals: a fall by 1 % of the curve's stress scale counts like a misfit of 100 %.
+#: Weight of a decreasing stress in the residuals: a decrease by 1 % of the divisor of the residuals counts like a
+#: misfit of 100 %.
 STIFFNESS = 100.0
 
 
@@ -41,7 +42,7 @@ class LawFit(NamedTuple):
     law: Law
     shear_modulus: float
     cost: float  # half the sum of squared relative residuals
-    curve_errors: dict[str, float]  # root mean square of the misfit, divided by that of the curve's stress
+    curve_errors: dict[str, float]  # root mean square of the misfit / of the curve's stress
     mean_relative_error: float  # root mean square of the relative misfit over all points
     aicc: float
     bic: float
@@ -58,15 +59,16 @@ class LawFit(NamedTuple):
 #: reported if they change a parameter by more than _HIDDEN standard errors and by more than the fraction _MOVED of its
 #: value.
 _HIDDEN, _MOVED = 2.0, 0.05
-#: A parameter ran into a limit of its law if two conditions hold. It ended above or below its typical size by more than
-#: the factor RUNAWAY, and its error is at least FREE times its value. The second condition is needed because typical
-#: sizes hold for large strains. At small strains, coefficients of higher terms may be far larger and still determined.
+#: A parameter ran into a limit of its law under two conditions. It ended above or below its typical size by more than
+#: the factor RUNAWAY, and its standard error is at least FREE times its value. The second condition is needed because
+#: typical sizes are valid for large strains. At small strains, coefficients of higher terms may be far larger, and the
+#: data may still determine them.
 RUNAWAY, FREE = 1e6, 30.0
 #: The comparison with FREE assumes at least this relative noise, because no test is more accurate.
 _LEAST_NOISE = 1e-3
-#: _REPEATS: number of repeated fits in which the law's stress gives the divisors of the residuals. No fit is repeated
-#: if the law's stress is below _LEAST_SIZE times the measured stress in a curve. If the stress of a curve differs by
-#: more than the factor _FOREIGN from that of other curves of the same test, it may be wrong, e.g. in another unit.
+#: _REPEATS: number of repeated fits whose residuals are divided by the law's stress. No fit is repeated if the law's
+#: stress is below _LEAST_SIZE times the measured stress in a curve. If the stress of a curve differs by more than the
+#: factor _FOREIGN from the stress of other curves of the same test, it may be wrong, e.g. in another unit.
 _REPEATS, _LEAST_SIZE, _FOREIGN = 3, 0.05, 2.0
 _tangents = jax.jit(lambda law, F: law.tangent(F))
 
@@ -91,12 +93,13 @@ def initial_modulus(curves: list[Curve]) -> float:
 
 def fit(candidate: Candidate, curves: list[Curve], starts: int = STARTS) -> LawFit:
     """Minimise the sum of squares of the relative misfit. The misfit is the difference between the nominal stress P of
-    the law and the measured stress, divided by the root mean square of the curve's stress. A stress that falls while
-    the sample is deformed further adds a penalty (`STIFFNESS`). Return the best minimum from many starting points.
+    the law and the measured stress, divided by the root mean square of the curve's stress. If the stress decreases
+    while the sample is deformed further, a penalty is added (`STIFFNESS`). Return the lowest minimum from many starting
+    points.
 
-    If several curves belong to one test, the root mean square of the law's stress is the divisor. With the measured
-    stress, samples that are soft by chance would have more weight, and the moduli would be too low: by 8 % if samples
-    scatter by 20 %.
+    If several curves belong to one test, the divisor is the root mean square of the law's stress. With the measured
+    stress as divisor, samples that are soft by chance would have more weight. The moduli would then be too low: by 8 %
+    if samples scatter by 20 %.
     """
     check_curves(curves)
     scale = initial_modulus(curves)
@@ -135,12 +138,13 @@ def fit(candidate: Candidate, curves: list[Curve], starts: int = STARTS) -> LawF
 
 
 def _sizes_of_law(found: Solution, curves: list[Curve], sizes: np.ndarray) -> list[float] | None:
-    """Return the divisors [Pa] of the residuals of each curve for the best law. Return None if the stress of this law
-    is far below the measured stress in a curve, or not finite.
+    """Return the divisor [Pa] of the residuals of each curve for the best parameters in `found`. Return None if the
+    stress of this law is far below the measured stress in a curve, or not finite.
 
     If no other curve belongs to the same test, the divisor is the root mean square of the measured stress. Otherwise,
-    it is the root mean square of the law's stress. If the measured stress differs from that of the other curves by more
-    than the factor `_FOREIGN`, it is the larger of both. `sizes` (n,): divisors of the n residuals of `found`.
+    the divisor is the root mean square of the law's stress. If the ratio of measured stress and law's stress differs
+    from the ratio of the other curves by more than the factor `_FOREIGN`, the divisor is the larger of both root mean
+    squares. `sizes` (n,): divisors of the n residuals of `found`.
     """
     costs = np.where(np.isfinite(found.cost), np.asarray(found.cost), np.inf)
     off = np.asarray(found.residuals)[int(np.argmin(costs))][: len(sizes)] * sizes
@@ -159,9 +163,9 @@ def _sizes_of_law(found: Solution, curves: list[Curve], sizes: np.ndarray) -> li
 def assessed(
     candidate: Candidate, curves: list[Curve], found: Solution, scale: float, times: tuple, of_tests: bool = True
 ) -> LawFit:
-    """Return the fit from the best starting point, with its quality and with warnings for the user.
+    """Return the fit from the best starting point, with measures of its quality and with warnings for the user.
 
-    `of_tests`: whether each curve is one test, and the residuals are stress differences, divided by the curve's scale.
+    `of_tests`: whether each curve is one test, and the residuals are stress differences, divided by `Curve.divisor`.
     """
     costs = np.where(np.isfinite(found.cost), np.asarray(found.cost), np.inf)
     best = int(np.argmin(costs))
@@ -176,7 +180,7 @@ def assessed(
     slope = np.asarray(jax.jit(jax.jacfwd(candidate.values))(u, scale))
     every, _ = errors_and_correlation(spread(J[:n], max(noise, _LEAST_NOISE), slope)[0])
     limits = _run_away(candidate, values, every, scale)
-    # A parameter at its limit gets no standard error. The errors of the others hold for the law at this limit.
+    # A parameter at its limit gets no standard error. The other errors are valid for the law at this limit.
     known = np.array([name not in limits for name in candidate.names])
     own_J, own_slope = _with_products_of_limits(J[:n], slope, known)
     half, s = spread(own_J, noise, own_slope)
@@ -228,22 +232,23 @@ def _relative_to_measured(curves: list[Curve], misfit: np.ndarray) -> list[np.nd
 def _of_other_minima(
     candidate: Candidate, values: np.ndarray, us: np.ndarray, scale: float, curves: list[Curve]
 ) -> list[str]:
-    """Return a warning if some starting points led to the same cost with other parameter values (see
-    `of_other_minima`). `us` (S, p): p unknowns at the end of these S searches."""
+    """Return a warning if searches ended at the same cost, but with other parameter values (see `of_other_minima`).
+    `us` (S, p): p unknowns at the end of the S searches with this cost."""
     every = np.asarray(jax.vmap(lambda u: candidate.values(u, scale))(jnp.asarray(us)))
     return of_other_minima(candidate.names, candidate.law, values, every, np.concatenate([c.F for c in curves]))
 
 
 #: First words of the warning about factors that multiply the stress of each test, or of all tests of a file.
 OWN_FACTORS = ("the stress of each test seems", "the stress of each file seems")
-#: If the residuals show factors, those of tests and those of files are both used if their likelihoods (logarithms)
-#: differ by less than this.
+#: If the residuals show factors of tests or of files, the standard errors contain the more likely of both kinds. They
+#: contain the other kind too if its log likelihood is lower by less than this value.
 _AS_LIKELY = 2.0
 
 
 def _of_noise(alike: Alike | None, factors: list[FactorNoise], n: int, tests: int) -> list[str]:
     """Return warnings about correlated noise of the n points, and about factors that multiply the stress of each
-    test. If both the factors of tests and those of files explain the residuals, the more probable ones are reported."""
+    test. If factors of tests and factors of files both explain the residuals, only the more probable kind is
+    reported."""
     told = []
     if alike is not None:
         told.append(
@@ -265,8 +270,8 @@ def _of_noise(alike: Alike | None, factors: list[FactorNoise], n: int, tests: in
 def _of_hidden_factors(
     every: list[FactorNoise], tests: int, names: np.ndarray, values: np.ndarray, errors: np.ndarray
 ) -> list[str]:
-    """Return a warning about factors that may multiply the stress of each test. The residuals do not show such factors,
-    because the parameters compensate for these factors."""
+    """Return a warning about factors that may multiply the stress of each test, but that the residuals do not show. The
+    parameters compensate such factors."""
     if not every or every[0].series != tests or any(own.shown for own in every):
         return []
     factors = every[0]
@@ -289,18 +294,18 @@ def _errors_of_law(
     half: np.ndarray,
     of_tests: bool,
 ) -> tuple[np.ndarray, np.ndarray, Alike | None, list[FactorNoise]]:
-    """Return the standard errors and the correlation of the P parameters, the noise that is correlated between
-    neighbouring points, and the factors that multiply the stress of each test, and of each file. A file may contain the
-    tests of one sample, or of several. The errors and the correlation belong to one covariance that covers the
-    covariances for several kinds of noise (`covering_root`).
+    """Return four results: the standard errors of the P parameters, their correlation, the noise that is correlated
+    between neighbouring points, and the factors that multiply the stress of each test and of each file. A file may
+    contain the tests of one sample, or of several samples. The standard errors and the correlation are computed from
+    one covariance, which covers the covariances for several kinds of noise (`covering_root`).
 
     Args:
         curves: the fitted curves.
         residuals: at n points: derivatives J (n, p) of the misfit, misfit (n,) and its standard deviation.
         slope: derivatives (P, p) of the parameters with respect to the p unknowns.
         half: square root of the covariance of the parameters, for equal and independent noise.
-        of_tests: see `assessed`. If False, the fit considers neither factors that multiply a test nor noise that grows
-            with the stress.
+        of_tests: see `assessed`. If False, factors that multiply a test, and noise that grows with the stress, are not
+            considered.
     """
     J, misfit, noise = residuals
     if not (np.all(np.isfinite(misfit)) and np.all(np.isfinite(half))):
@@ -367,9 +372,9 @@ def _warnings(fit: LawFit, curves: list[Curve], singular: np.ndarray, held: bool
 
 
 def _run_away(candidate: Candidate, values: np.ndarray, errors: np.ndarray, scale: float) -> dict[str, str]:
-    """Return the parameters that ended far from every starting point and that the data do not determine, with the limit
-    of each (0 or infinity). `errors` (p,): standard errors of all p parameters if none is at its limit. The starting
-    points lie within a few times the typical size.
+    """Return the parameters that the data do not determine and that ended far from their typical size. The value of
+    each is its limit, 0 or infinity. `errors` (p,): standard errors of the p parameters, computed as if no parameter
+    were at its limit. The typical size is a median over the starting points.
     """
     starts = jnp.asarray(candidate.random(np.random.default_rng(0), STARTS))
     typical = np.median(np.abs(jax.vmap(lambda u: candidate.values(u, scale))(starts)), axis=0)
@@ -390,8 +395,8 @@ def _with_products_of_limits(J: np.ndarray, slope: np.ndarray, known: np.ndarray
     """Return the derivatives (n, k + q) of the misfit with respect to the unknowns of the k known parameters and to q
     directions (`_DETERMINED`). Also return the derivatives (k, k + q) of the known parameters.
 
-    For example, one parameter goes to infinity and another to 0, and their product is a modulus. Without this product,
-    the errors of the other parameters would hold only for a known modulus.
+    For example, one parameter goes to infinity and another to 0, and their product is a modulus. This product is then a
+    direction. Without this direction, the errors of the other parameters would be valid only for a known modulus.
 
     Args:
         J: derivatives (n, p) of the misfit with respect to the p unknowns.
@@ -406,10 +411,11 @@ def _with_products_of_limits(J: np.ndarray, slope: np.ndarray, known: np.ndarray
     return np.column_stack([own, (U * s)[:, shown]]), np.pad(own_slope, ((0, 0), (0, len(shown))))
 
 
-#: The program warns if the stress of the undeformed sample exceeds this fraction of the root mean square of the curve's
-#: stress.
+#: The program warns if the stress of the undeformed sample, divided by the root mean square of the curve's stress,
+#: exceeds this value.
 _PRELOAD = 0.05
-#: A row counts as undeformed if no in-plane component of F - I exceeds this fraction of the range of the driven one.
+#: The sample counts as undeformed if no in-plane component of F - I exceeds this fraction of the range of the driven
+#: component.
 _UNDEFORMED = 0.02
 
 
@@ -424,7 +430,7 @@ def loaded_at_rest(curves: list[Curve]) -> list[str]:
         far = strain > _UNDEFORMED * np.ptp(driven) or np.abs(driven[near]).max() > 0.2 * np.ptp(driven)
         if curve.test == "general" or far:
             continue
-        # A straight line through the three points nearest to rest gives the stress at rest.
+        # The stress at rest is computed from a straight line through the three points nearest to rest.
         offset = np.polyfit(driven[near], curve.stress[near], 1)[1] if np.ptp(driven[near]) > 0 else 0.0
         if abs(offset) > _PRELOAD * curve.scale:
             told.append(

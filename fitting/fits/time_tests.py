@@ -1,7 +1,7 @@
 """Prony modes from a relaxation or creep test, in closed form.
 
-The driven quantity is the measured load: the strain in relaxation, the stress in creep. The measured values that are
-fitted belong to the other quantity, the response.
+The driven quantity is the measured load: the strain in relaxation, the stress in creep. The response is the other
+quantity: the stress in relaxation, the strain in creep. The fit describes the measured values of the response.
 """
 
 from collections.abc import Callable
@@ -26,21 +26,21 @@ from fitting.waves import shear_waves
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: STILL: a load is regarded as changing if two successive rows differ by more than this fraction of the maximum load.
+#: STILL: the load changes between two successive rows if they differ by more than this fraction of the maximum load.
 #: MOST_LOADS: maximum number of loads that are treated separately.
 STILL, MOST_LOADS = 0.01, 10
-#: Maximum number of measured values that are fitted. If a record has more values, values at about equal steps of log
-#: time are used.
+#: Maximum number of measured values in a fit. If a record has more values, only some of them are used, at about equal
+#: steps of log time.
 MOST = 300
-#: Key in `TimeFit.details` if the noise of neighbouring values is correlated: the number of independent values that
-#: carry the same information.
+#: Key in `TimeFit.details` if the noise of neighbouring values is correlated. Its value is a number N: N independent
+#: values carry the same information.
 INDEPENDENT = "independent_answers"
-#: Key in `TimeFit.details`: whether the noise of all measured values has the same size.
+#: Key in `TimeFit.details`. Its value states whether the noise of all measured values has the same standard deviation.
 CONSTANT_NOISE = "noise_of_constant_size"
 #: Number of starting points of a fit.
 STARTS = 12
-#: A response has decayed if the fitted and the measured value are below the first number times the noise, and also
-#: below the second number times the largest measured value.
+#: A response has decayed if the fitted and the measured value are below two limits: the first number times the noise,
+#: and the second number times the largest measured value.
 _DECAYED = 10.0, 0.1
 
 
@@ -82,8 +82,8 @@ def relative_sizes(measured: np.ndarray, fitted: np.ndarray, scales: np.ndarray,
     If the response changes sign, as in cycles, the divisors are the scales of the residuals. In other tests, these
     scales would hide noise, because the lower bound of the scales is 33 times the noise.
 
-    A value does not count if the response has decayed into its noise, because then its relative error is large for any
-    model. Its divisor is infinite. See `_DECAYED`.
+    A value does not count if the response has decayed into its noise (`_DECAYED`), because then its relative error is
+    large for any model. The divisor of such a value is infinite.
     """
     largest = np.abs(measured).max(initial=0.0)
     if min(measured.max(initial=0.0), -measured.min(initial=0.0)) > 0.1 * largest:
@@ -96,9 +96,9 @@ def relative_sizes(measured: np.ndarray, fitted: np.ndarray, scales: np.ndarray,
 def sizes_of_prediction(
     measured: np.ndarray, predicted: np.ndarray, scales: np.ndarray, rounding: float = 0.0
 ) -> np.ndarray:
-    """Return the divisors (m,) for the relative errors of a test that was not fitted. Unlike `relative_sizes`, they do
-    not grow with the error of the prediction. A value does not count (infinite divisor) if both the measured and the
-    predicted response have decayed into the noise."""
+    """Return the divisors (m,) for the relative errors of a test that was predicted, not fitted. The divisors do not
+    grow with the error of the prediction, unlike `relative_sizes`. A value does not count (infinite divisor) if both
+    the measured and the predicted response have decayed into the noise."""
     largest = np.abs(measured).max(initial=0.0)
     if min(measured.max(initial=0.0), -measured.min(initial=0.0)) > 0.1 * largest:
         return scales
@@ -121,8 +121,8 @@ def _size_of_decayed(measured: np.ndarray, off: np.ndarray, rounding: float) -> 
 
 @lru_cache(maxsize=8)
 def _residuals(kind: str, name: str) -> Callable[..., jax.Array]:
-    """Return a function from (u, time, driven, rows, answer, scales) to the residuals (m,) of m measured values, for
-    relaxation or creep."""
+    """Return a function of (u, time, driven, rows, answer, scales). The function computes the residuals (m,) of m
+    measured values, for relaxation or creep."""
     natural = generalised_maxwell.natural_fluid if name == FLUID.name else generalised_maxwell.natural
 
     def residuals(u, time, driven, rows, answer, scales):
@@ -132,8 +132,8 @@ def _residuals(kind: str, name: str) -> Callable[..., jax.Array]:
 
 
 def thinned(test: TimeTest) -> np.ndarray:
-    """Return the indices (m,) of the rows of the test that are fitted: all rows, or about `MOST` rows. These rows are
-    spread over the log of the time since the load last began to change."""
+    """Return the indices (m,) of the fitted rows of the test: all usable rows, or about `MOST` of them. The selected
+    rows are spread over the log of the time since the load last began to change."""
     rows = np.flatnonzero(test.used)
     if len(rows) <= MOST:
         return rows
@@ -142,7 +142,7 @@ def thinned(test: TimeTest) -> np.ndarray:
     of_load = np.searchsorted(begins, test.time[rows]) - 1
     picked: list[np.ndarray] = []
     left = MOST
-    # If a load has few rows, the other loads may use more rows.
+    # Loads with few rows come first, so that the other loads can use more rows.
     for done, k in enumerate(np.argsort(np.bincount(of_load, minlength=len(begins)), kind="stable")):
         own = rows[of_load == k]
         picked.append(own[_spread_places(test.time[own] - begins[k], left // (len(begins) - done))])
@@ -163,8 +163,8 @@ def _begins_of_loads(test: TimeTest) -> np.ndarray:
 
 
 def _spread_places(time: np.ndarray, number: int) -> np.ndarray:
-    """Return about `number` indices of increasing times (n,) [s] above 0. Times that are far apart in log time are all
-    kept. Of the other times, some at equal distances in log time are kept.
+    """Select about `number` of n increasing times (n,) [s] above 0, and return their indices. Times that are far apart
+    in log time are all selected. From the other times, some at about equal distances in log time are selected.
     """
     if len(time) <= number:
         return np.arange(len(time))
@@ -202,8 +202,8 @@ def fit(test: TimeTest, modes: int | str = "auto") -> TimeFit:
 
 
 def _raised(test: TimeTest, rows: np.ndarray, numbers: range, kind: Kind) -> list[TimeFit]:
-    """Return fits with more and more modes. The search ends after two fits in a row that do not lower the criterion, do
-    not converge, or have superfluous modes. It also ends after an exact fit."""
+    """Return fits with increasing numbers of modes. The search ends after two fits in a row that do not lower the
+    criterion, do not converge, or have superfluous modes. It also ends after an exact fit."""
     tried: list[TimeFit] = []
     best, failures = np.inf, 0
     for n in numbers:
@@ -244,8 +244,8 @@ def _one_model(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind) -> Time
 
 
 def refitted(fit: TimeFit, test: TimeTest) -> TimeFit:
-    """Fit Prony modes to `test`, with the same kind and number of modes as in `fit`. `test` is a changed form of the
-    test that `fit` describes."""
+    """Fit Prony modes to `test`, with the same kind and number of modes as in `fit`. `test` is a changed version of the
+    test that was fitted in `fit`."""
     return _one_model(test, thinned(test), fit.modes, fit.kind)
 
 
@@ -261,8 +261,8 @@ def residuals_in_time(test: TimeTest, kind: Kind) -> tuple[Callable[..., jax.Arr
 
 
 def data_in_time(test: TimeTest) -> tuple[np.ndarray, ...]:
-    """Return n times (n,), the driven quantity (n,) at these times, the indices (m,) of the m measured values among
-    these times, the measured values (m,) themselves, and their scales (m,)."""
+    """Return five arrays: n times (n,), the driven quantity (n,) at these times, the indices (m,) of the times of the m
+    measured values, the measured values (m,), and their scales (m,)."""
     rows = thinned(test)
     kept = _corners_in_time(test.time, test.driven)
     kept[rows] = True
@@ -271,8 +271,8 @@ def data_in_time(test: TimeTest) -> tuple[np.ndarray, ...]:
 
 
 def _corners_in_time(time: np.ndarray, driven: np.ndarray) -> np.ndarray:
-    """Return whether the driven quantity has a corner at each point (n,). There is no corner if the derivative is the
-    same on both sides."""
+    """Return a mask (n,) of the points at which the driven quantity has a corner. At a corner, the derivatives on both
+    sides differ. The first and the last point count as corners."""
     kept = np.ones(len(time), bool)
     middle = driven[:-2] + (driven[2:] - driven[:-2]) * (time[1:-1] - time[:-2]) / (time[2:] - time[:-2])
     kept[1:-1] = np.abs(driven[1:-1] - middle) > 1e-12 * np.max(np.abs(driven))
@@ -295,9 +295,9 @@ def response_in_time(kind: str, model: Maxwell, at: Array, *drive: Array) -> Arr
         kind: "sweep", "dispersion", "relaxation" or "creep".
         model: Prony modes.
         at: angular frequencies (n,) [rad/s], or times (n,) [s].
-        drive: for relaxation and creep, the driven quantity (n,) and the indices (m,) of the measured values among the
-            times. For dispersion, the density and the indices (m,) of the measured values among velocities [m/s]
-            followed by attenuations [1/m].
+        drive: for relaxation and creep, the driven quantity (n,) and the indices (m,) of the times of the measured
+            values. For dispersion, the density and the indices (m,) of the measured values in an array that contains
+            first the velocities [m/s] and then the attenuations [1/m].
     """
     xp = arrays_of(model.ratios)
     if kind == "sweep":
@@ -313,8 +313,8 @@ def response_in_time(kind: str, model: Maxwell, at: Array, *drive: Array) -> Arr
 
 
 def apparent(test: TimeTest) -> tuple[np.ndarray, np.ndarray]:
-    """Return the stress divided by the strain (m,) [Pa] at the m measured values, which is roughly the relaxation
-    modulus G(t). Also return the times (m,) [s] of these values since the last change of the load."""
+    """Return the ratio stress / strain (m,) [Pa] at the m measured values. It is roughly the relaxation modulus G(t).
+    Also return the times (m,) [s] of these values since the last change of the load."""
     rows = thinned(test)
     driven, answer = np.abs(test.driven[rows]), np.maximum(np.abs(test.answer[rows]), 1e-3 * _scales(test, rows))
     ratio = answer / np.maximum(driven, 1e-6 * driven.max())
@@ -324,7 +324,7 @@ def apparent(test: TimeTest) -> tuple[np.ndarray, np.ndarray]:
 def apparent_equations(test: TimeTest, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the matrix and the right-hand side of a linear least-squares problem for the modulus of `apparent`, with
     relative residuals. The unknowns are the equilibrium modulus and the strengths of modes with the relaxation `times`
-    [s]. Responses below the lower bound of their scale are mostly noise and have less weight."""
+    [s]. Responses far below their scale are mostly noise, and have less weight."""
     modulus, at = apparent(test)
     rows = thinned(test)
     weights = np.minimum(np.abs(test.answer[rows]) / _scales(test, rows), 1.0)
@@ -333,8 +333,8 @@ def apparent_equations(test: TimeTest, times: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _starts(test: TimeTest, modes: int, kind: Kind) -> np.ndarray:
-    """Return starting points with relaxation times that are spread over the decades of the test. The strengths come
-    from non-negative least squares on the apparent modulus (`apparent`)."""
+    """Return starting points with relaxation times that are spread over the decades of the test. The strengths are
+    fitted to the apparent modulus (`apparent`) by non-negative least squares."""
     each = generalised_maxwell.times_over(test.resolved, modes, STARTS)
     found = [generalised_maxwell.start_at_times(times, *apparent_equations(test, times)) for times in each]
     return np.stack([generalised_maxwell.fluid_of(u) if kind.name == FLUID.name else u for u in found])
@@ -384,14 +384,14 @@ def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
     return chosen._replace(warnings=tuple(out), details=details, **seconds)
 
 
-#: Key in `TimeFit.details`: modulus [Pa], with standard error, of an elastic material that explains the test equally
-#: well.
+#: Key in `TimeFit.details`. Its value is the modulus [Pa], with standard error, of an elastic material that explains
+#: the test as well as the fit.
 ELASTIC = "elastic"
 
 
 def _without_relaxation(test: TimeTest, chosen: TimeFit) -> dict[str, float] | None:
-    """Return the modulus of an elastic material if this material explains the test as well as the chosen fit, otherwise
-    None."""
+    """Return the modulus of an elastic material with its errors, if this material explains the test as well as the
+    chosen fit. Otherwise return None."""
     rows = thinned(test)
     x, y, s = test.driven[rows], test.answer[rows], _scales(test, rows)
     square = float(np.sum((x / s) ** 2))
@@ -410,8 +410,8 @@ def _without_relaxation(test: TimeTest, chosen: TimeFit) -> dict[str, float] | N
 
 
 def with_elastic_error(fit: TimeFit, factor: float) -> TimeFit:
-    """Return the fit, in which the standard error due to noise of the elastic modulus (`ELASTIC`) is larger by a
-    factor. The error of the subtracted base line does not change."""
+    """Multiply the standard error of the elastic modulus (`ELASTIC`) due to noise by a factor. The error due to the
+    subtracted base line does not change."""
     if ELASTIC not in fit.details:
         return fit
     before = fit.details[ELASTIC]

@@ -32,7 +32,7 @@ class Kind(NamedTuple):
     names: tuple[str, ...] = ()  # names of the model's parameters; empty: the modes are the parameters
     units: tuple[str, ...] = ()
     values: Callable[[Array], Array] | None = None  # u -> P parameters of the model (P,)
-    prior: Callable[[Array], Array] | None = None  # u -> residuals of the prior, which follow those of the data
+    prior: Callable[[Array], Array] | None = None  # u -> residuals of the prior, placed after the residuals of the data
     effective: float | None = None  # number of parameters that the data determine; None: the length of u
     moduli: Callable[[Array, Array], tuple[Array, Array]] | None = None  # (u, omega) -> G', G'' (n,) [Pa]
 
@@ -62,7 +62,7 @@ class Fit(NamedTuple):
         return len(self.model.ratios)
 
     def relative_errors(self, sweep: Sweep) -> np.ndarray:
-        """Return the relative errors |fit / data - 1| (2n,) of G' then G'' at n frequencies."""
+        """Return the relative errors |fit / data - 1| (2n,) of G' and then of G'' at n frequencies."""
         data = np.concatenate([sweep.storage, sweep.loss])
         return np.abs(np.concatenate([self.storage, self.loss]) / data - 1)
 
@@ -79,7 +79,7 @@ def timed(function: Callable, *arguments: Any) -> tuple[Any, float, float]:
     return result, middle - begin, time.perf_counter() - middle
 
 
-@lru_cache(maxsize=16)  # fits of several samples, or of parts of a band, use the same compiled program
+@lru_cache(maxsize=16)  # fits of several samples or parts of a band use one compiled program
 def _compiled(function: Callable, tree: Any, kinds: tuple) -> Callable:
     arguments = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in kinds])
     return jax.jit(function).lower(*arguments).compile()
@@ -98,7 +98,7 @@ def best_of(minimise: Callable, residuals: Callable) -> Callable[..., Solution]:
 
 
 def whole_number(modes: int | str, otherwise: str = 'give "auto"') -> int:
-    """Return a number of modes. Raise `InputError` if it is not a whole number. `otherwise`: what else the user can
+    """Return `modes` as an integer. Raise `InputError` if it is not a whole number. `otherwise`: what else the user can
     do."""
     if isinstance(modes, bool) or not isinstance(modes, (int, np.integer)):
         raise InputError(f"modes = {modes!r} must be a whole number: give e.g. 2, or {otherwise}")
@@ -131,7 +131,7 @@ def check_modes(sweep: Sweep, modes: int | str) -> None:
 
 
 def closed_form(sweep: Sweep, modes: int, dense: Spectrum | None = None, optimizer: str = "levenberg-marquardt") -> Fit:
-    """Fit the closed-form moduli from several starting points, and return the best minimum.
+    """Fit the closed-form moduli from several starting points, and return the lowest minimum.
 
     Args:
         sweep: data; residuals are divided by `sweep.deviations`.
@@ -146,7 +146,7 @@ def closed_form(sweep: Sweep, modes: int, dense: Spectrum | None = None, optimiz
 
 
 def modes_from(sweep: Sweep, starts: np.ndarray, kind: Kind = Kind(), optimizer: str = OPTIMIZERS[0]) -> Fit:
-    """Return the best fit of Prony modes from the S starting points `starts` (S, P) of P variables. `kind` states
+    """Fit Prony modes from the S starting points `starts` (S, P) of P variables, and return the best fit. `kind` states
     whether the modes form a solid or a fluid."""
     data = (sweep.angular_frequency, sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
     if optimizer == OPTIMIZERS[0]:
@@ -164,8 +164,8 @@ def residuals_of(kind: Kind) -> Callable[..., Array]:
 
 
 def fitted(sweep: Sweep, found: Solution, kind: Kind, running: float, compiling: float, details: Content) -> Fit:
-    """Return the closed-form fit for the minimum `found` over the variables u of `kind`. The first residuals of `found`
-    must be those of the data."""
+    """Return the closed-form fit at the minimum `found` for the variables u of `kind`. The first residuals of `found`
+    must be the residuals of the data."""
     scales, measured = np.concatenate(sweep.deviations), np.concatenate([sweep.storage, sweep.loss])
     storage, loss = np.split(np.asarray(found.residuals)[: len(measured)] * scales + measured, 2)
     simulated = BestPoint("closed-form", found, storage, loss)
@@ -209,11 +209,11 @@ def fit_at(sweep: Sweep, at: BestPoint, kind: Kind, seconds: tuple[float, float]
 def estimates(
     found: Solution, kind: Kind, data: tuple[int, bool], noise_root: np.ndarray | None
 ) -> tuple[Estimate, Estimate | None]:
-    """Return the estimate of the Prony modes, and that of the parameters of another model (None if the modes are the
+    """Return two estimates: of the Prony modes, and of the parameters of another model (None if the modes are the
     parameters).
 
     Args:
-        found: the minimum over the variables u of `kind`.
+        found: the minimum for the variables u of `kind`.
         kind: the meaning of u.
         data: number of measured residuals, and whether the data have standard deviations.
         noise_root: see `root_of_noise_shown`.
@@ -231,8 +231,9 @@ def estimates(
 def of_noise_shown(
     estimate: Estimate, natural_of: Callable[[Array], Array], u: Array, noise_root: np.ndarray | None
 ) -> Estimate:
-    """Return the estimate with standard errors for the noise that the residuals show (`root_of_noise_shown`), or
-    unchanged if this is None. `natural_of`: function from u to the parameters of the estimate."""
+    """Return the estimate with standard errors for the noise that the residuals show. `noise_root`: see
+    `root_of_noise_shown`; if it is None, the estimate is unchanged. `natural_of`: function from u to the parameters of
+    the estimate."""
     if noise_root is None:
         return estimate
     root = with_slope(natural_of, u)[1] @ noise_root
@@ -242,9 +243,9 @@ def of_noise_shown(
 
 
 def root_of_noise_shown(found: Solution, sweep: Sweep) -> np.ndarray | None:
-    """Return the square root (p, k) of the covariance of the p unknowns u for the noise that the residuals show. This
-    may be noise that is correlated between repeated measurements at one frequency, noise of different size in G' and
-    G'', or noise with one size in Pa. Returns None if the residuals show no such noise."""
+    """Return the square root (p, k) of the covariance of the p unknowns u for the noise that the residuals show. There
+    are three kinds of such noise: it is correlated between repeated measurements at one frequency, it has different
+    relative sizes in G' and G'', or it has a constant size in Pa. Returns None if the residuals show no such noise."""
     J, r = np.asarray(found.jacobian), np.asarray(found.residuals)
     root = _of_repeats(J, r, sweep.angular_frequency)
     if root is not None:
@@ -255,7 +256,8 @@ def root_of_noise_shown(found: Solution, sweep: Sweep) -> np.ndarray | None:
 
 def sizes_of_noise(fit: Fit, sweep: Sweep) -> np.ndarray | None:
     """Return the standard deviations (2n,) of the residuals of G' and G'' at n frequencies, if the residuals show that
-    these differ (`sizes_shown`). Returns None if all may be equal, or if standard deviations are given."""
+    the standard deviations differ (`sizes_shown`). Returns None if they may be equal, or if standard deviations are
+    given."""
     J, r = np.asarray(fit.solution.jacobian), np.asarray(fit.solution.residuals)
     return None if fit.noise_root is None else sizes_shown(J, r, np.concatenate(sweep.deviations))
 
@@ -277,9 +279,9 @@ FLUID = Kind("prony_fluid", generalised_maxwell.natural_fluid)
 
 
 def _misfit(sweep: Sweep, storage: np.ndarray, loss: np.ndarray, kind: Kind) -> tuple[str, ...]:
-    """Return a warning with the worst point, if the model does not fit the data."""
-    # If the deviations come from the scatter of the points, errors of the phase angle may be their cause. Small loss
-    # moduli then have large relative errors, so their errors are divided by |G*|.
+    """Return a warning that names the point with the largest error, if the model does not fit the data."""
+    # If the standard deviations were estimated from the scatter of the points, errors of the phase angle may cause this
+    # scatter. Then small loss moduli have large relative errors, so errors of G'' are divided by |G*|.
     size = np.hypot(sweep.storage, sweep.loss) if sweep.sd_estimated else sweep.loss
     e = np.abs(np.concatenate([storage / sweep.storage - 1, (loss - sweep.loss) / size]))
     if e.mean() < 0.05 and e.max() < 0.3:
@@ -303,8 +305,8 @@ def number_of_parameters(fit: Fit) -> float:
 
 
 def mean_square(fit: Fit) -> float:
-    """Return the mean square of the residuals of the data, but at least `ZERO`. Exact fits have smaller values, which
-    differ only by roundoff."""
+    """Return the mean square of the residuals of the data, but at least `ZERO`. Smaller values are only roundoff of
+    exact fits."""
     m = 2 * len(fit.storage)
     return max(float(np.sum(np.asarray(fit.solution.residuals)[:m] ** 2)) / m, ZERO)
 
@@ -318,9 +320,9 @@ def information_criterion(fit: Fit) -> float:
 
 #: Key in `Fit.details` of the table of tried numbers of modes.
 TRIED = "modes_tried"
-#: End of the warning about a number of modes whose fit failed.
+#: End of the warning about a failed fit with some number of modes.
 NOT_FITTED = "so this number of modes could not be chosen"
-#: A fit counts as exact if all its relative errors are below this value, because no data have so many digits.
+#: A fit counts as exact if all its relative errors are below this value. No measured data are so accurate.
 EXACT = 1e-7
 
 
@@ -330,12 +332,13 @@ def choose_modes(
     optimizer: str = OPTIMIZERS[0],
     progress: Callable[[str], None] = lambda text: None,
 ) -> tuple[Fit, list[Fit]]:
-    """Raise the number of modes while the criterion falls and every mode is identifiable, or until the fit is exact.
+    """Increase the number of modes while the criterion falls and every mode is identifiable, or until the fit is exact.
     Return the chosen fit and all tried fits. `progress` is called with the name of each fit.
 
-    A single failure may be a local minimum, so the search ends only after two failures in a row. If the computation for
-    a number of modes raises an error, this counts as a failure too. A warning then names this number of modes, and the
-    search continues with the other fits.
+    A failure is a fit that does not lower the criterion or has superfluous modes. A single failure may be a local
+    minimum, so the search ends only after two failures in a row. If the computation for a number of modes raises an
+    error, this counts as a failure too. A warning then names this number of modes, and the search continues with the
+    other fits.
     """
     cap = most_modes(sweep)
     tried: list[Fit] = []
@@ -408,13 +411,13 @@ def closer_but_not_chosen(modes: int, errors: list[float], converged: bool) -> s
     )
 
 
-#: Words that identify the most important warnings, in order of importance.
+#: Words in the most important warnings, in order of importance.
 MISSES, SHORT = "the fit misses the data", "the test ends before the material has relaxed"
 IMPORTANT = ("did not converge", MISSES, "Kramers-Kronig", "that relaxes", "structured misfit", SHORT, "half decade")
 
 
 def by_importance(sentences: Sequence[str]) -> tuple[str, ...]:
-    """Return the warnings in the order of `IMPORTANT`. The other warnings follow in their given order."""
+    """Sort the warnings in the order of `IMPORTANT`. The other warnings follow in their given order."""
 
     def place(sentence: str) -> int:
         return next((k for k, words in enumerate(IMPORTANT) if words in sentence), len(IMPORTANT))

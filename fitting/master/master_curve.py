@@ -49,8 +49,8 @@ def master_curve(data: AtTemperatures, reference: float | None, vertical: bool =
 
     Args:
         data: sweeps at two or more temperatures.
-        reference: reference temperature [K]; the nearest measured temperature is used. None: the middle temperature or,
-            if the file gives shift factors, the temperature with the factor nearest to 1.
+        reference: reference temperature [K]; the nearest measured temperature is used. None: the middle temperature. If
+            the file gives shift factors, None means the temperature with the factor nearest to 1.
         vertical: whether factors that multiply the moduli are fitted too. Such factors cannot be fitted if the file
             gives the shift factors.
     """
@@ -64,7 +64,7 @@ def master_curve(data: AtTemperatures, reference: float | None, vertical: bool =
     untold: list[str] = []
     if data.shift_factors is not None:
         log_a = np.log10(data.shift_factors)
-        if reference is None:  # the given factors refer to the temperature with the factor 1
+        if reference is None:  # the reference of the given factors is the temperature with the factor 1
             place = int(np.argmin(np.abs(log_a)))
             if log_a[place] != 0:
                 untold.append(
@@ -96,8 +96,8 @@ def _shifted_sweep(sweep: Sweep, log_a: float, log_b: float) -> Sweep:
 
 
 def _scatter_of_points(sweeps: list[Sweep]) -> float:
-    """Return the relative scatter of the points about a smooth curve: the median over G' and G'' of all sweeps. The
-    result is 0 if there are too few points."""
+    """Return the relative scatter of the points about a smooth curve: the median of the scatter of G' and G'' in all
+    sweeps. The result is 0 if there are too few points."""
     each = [scatter(*merged(s.angular_frequency, G)) for s in sweeps for G in (s.storage, s.loss)]
     known = [own for own in each if np.isfinite(own)]
     return float(np.median(known)) if known else 0.0
@@ -105,7 +105,7 @@ def _scatter_of_points(sweeps: list[Sweep]) -> float:
 
 def _sentences(found: Shifts, noise: float, vertical: bool) -> list[str]:
     """Return a note about the shifts, and warnings if the shifted sweeps do not lie on one curve or if a shift is
-    uncertain. `noise`: relative scatter of the points. `vertical`: whether factors of the moduli are asked for."""
+    uncertain. `noise`: relative scatter of the points. `vertical`: whether the user wants factors of the moduli."""
     T = celsius(found.temperatures)
     out = [
         f"{len(T)} sweeps from {T[0]:.4g} to {T[-1]:.4g} °C are shifted to {T[found.reference]:.4g} °C. The root mean "
@@ -132,9 +132,9 @@ def _sentences(found: Shifts, noise: float, vertical: bool) -> list[str]:
 
 
 def _factors_of_moduli(sweeps: list[Sweep], found: Shifts) -> list[str]:
-    """Return a note if the sweeps lie much nearer to one curve when their moduli are multiplied by factors too
-    (F-test). The distances in G' and in G'' have the weights of the fit with factors, so that the noise of one modulus
-    does not hide a change of the other one."""
+    """Return a note if the sweeps lie much nearer to one curve after their moduli are multiplied by factors (F-test).
+    The distances in G' and in G'' have the weights of the fit with factors. So the noise of one modulus does not hide a
+    change of the other modulus."""
     try:
         other = shifts.found(sweeps, found.temperatures, found.reference, vertical=True)
         chance = _chance_of_factors(sweeps, found, other)
@@ -156,13 +156,13 @@ def _factors_of_moduli(sweeps: list[Sweep], found: Shifts) -> list[str]:
 
 
 def _chance_of_factors(sweeps: list[Sweep], alone: Shifts, both: Shifts) -> float:
-    """Return the probability that factors of the moduli bring the sweeps so much nearer to one curve by chance
-    (F-test).
+    """Return the p-value of an F-test: the probability that factors of the moduli reduce the distance of the sweeps
+    from one curve so much by chance.
 
     Args:
         sweeps: the sweeps.
         alone, both: shifts without and with factors of the moduli. For the F-test, both are fitted again with the same
-            distance between knots: the smaller of their two distances.
+            distance between knots, the smaller one of `alone` and `both`.
 
     Raises:
         InputError: with this distance between knots, the shifted sweeps do not overlap.
@@ -179,13 +179,13 @@ def _chance_of_factors(sweeps: list[Sweep], alone: Shifts, both: Shifts) -> floa
 
 
 def _unshown_factors(sweeps: list[Sweep], found: Shifts) -> list[str]:
-    """Return a warning if a power law fits the sweeps as well as the common curve (F-test). For a power law, any shift
-    of the frequency can be replaced by a factor of the moduli, so the linearised errors are too small."""
+    """Return a warning if a power law fits the sweeps as well as the common curve (F-test). For a power law, a factor
+    of the moduli can replace any shift of the frequency, so the linearised errors are too small."""
     counts = [len(s.storage) for s in sweeps]
     of_sweep = np.repeat(np.eye(len(sweeps)), counts, axis=0)
     x = np.log10(np.concatenate([s.angular_frequency for s in sweeps]))[:, None]
     G = [np.log10(np.concatenate([getattr(s, name) for s in sweeps])) for name in ("storage", "loss")]
-    # A power law has the same slope in log G' and log G'', and the temperature moves both by the same distance.
+    # In a power law, log G' and log G'' have the same slope, and the temperature moves both by the same distance.
     A = np.block([[of_sweep, x, np.zeros_like(x)], [of_sweep, x, np.ones_like(x)]])
     y, weights = np.concatenate(G), np.repeat(found.weights, sum(counts))
     c = np.linalg.lstsq(weights[:, None] * A, weights * y, rcond=None)[0]
@@ -203,14 +203,14 @@ def _unshown_factors(sweeps: list[Sweep], found: Shifts) -> list[str]:
 
 
 def at_reference(tests: "Sequence[Measured]", shift: Content) -> "tuple[list[Measured], list[str]]":
-    """Return the tests with the frequencies and moduli that they have at the reference temperature, and a sentence on
-    each test at another temperature or at an unknown one. `shift`: `shift_numbers` of the master curve."""
+    """Return the tests, shifted to the reference temperature. Also return a sentence about each test whose temperature
+    is unknown or not the reference temperature. `shift`: `shift_numbers` of the master curve."""
     each = [_test_at_reference(test, shift) for test in tests]
     return [test for test, _ in each], [sentence for _, sentence in each if sentence]
 
 
 def _test_at_reference(test: "Measured", shift: Content) -> "tuple[Measured, str]":
-    """Return one test and the sentence of `at_reference` on it (empty if there is none)."""
+    """Return one test and its sentence for `at_reference` (empty if the test needs no sentence)."""
     reference, heat = shift["reference_temperature_C"], _temperatures_of(test)
     if not isinstance(test, Sweep) or not heat.size:
         add = "add a column temperature_C, or " if isinstance(test, Sweep) else ""
@@ -240,8 +240,8 @@ def _test_at_reference(test: "Measured", shift: Content) -> "tuple[Measured, str
 
 
 def _temperatures_of(test: "Measured") -> np.ndarray:
-    """Return the temperatures (n,) [°C] in the column of a sweep, or else in the name of its table. Empty if they are
-    unknown."""
+    """Return the temperatures (n,) [°C] from the column of a sweep, or from the name of its table if there is no such
+    column. The array is empty if they are unknown."""
     if not isinstance(test, Sweep):
         return np.empty(0)
     T = (test.raw or {}).get("temperature", np.empty(0))

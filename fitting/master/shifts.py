@@ -3,11 +3,11 @@
 The modulus at temperature T and frequency omega is 1 / b_T times the modulus at the reference temperature and frequency
 a_T omega. The curve is a cubic spline of log G' and of log G'' over log frequency. The curve and all factors are fitted
 together by least squares. So no model of the material is needed, and every factor has a standard error. If the noise
-differs between log G' and log G'', they get different weights. If it differs between the sweeps, their weights stay
-equal, and the standard errors contain the noise of each sweep. The distance between the knots of the spline is chosen
-from the data, because a curve that follows the noise would be steeper than the true curve. Then the errors of the
-factors, which depend on the slope of the curve, would be too small. Source: Ferry (1980), Viscoelastic properties of
-polymers, chapter 11.
+differs between log G' and log G'', they get different weights. If the noise differs between the sweeps, the weights of
+the sweeps stay equal, and the standard errors contain the noise of each sweep. The distance between the knots of the
+spline is chosen from the data. With too many knots, the curve would follow the noise and be steeper than the true
+curve. Then the errors of the factors, which depend on the slope of the curve, would be too small. Source: Ferry (1980),
+Viscoelastic properties of polymers, chapter 11.
 """
 
 from collections.abc import Sequence
@@ -22,21 +22,21 @@ from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
 
 #: KNOTS: distances between two knots [decades] that are tried. SMOOTH: weight of the penalty on third differences of
-#: the spline coefficients. The penalty is needed for knots without data.
+#: the spline coefficients. The penalty is needed for knots without data between them.
 KNOTS, SMOOTH = (0.4, 0.6, 0.9, 1.35, 2.0, 3.0), 1e-3
 #: LONGEST: maximum step of a factor in one iteration [decades]. The iteration ends if all steps are below CONVERGED, or
 #: if a step reduces the sum of squares by less than the fraction FLAT.
 #: DAMPING: first and largest damping of a step (Levenberg 1944). A step that increases the sum of squares is repeated
 #: with ten times the damping.
 LONGEST, CONVERGED, FLAT, DAMPING = 0.3, 1e-6, 1e-6, (1e-6, 1e3)
-#: Settings for the first estimate of a shift. OVERLAP: minimum fraction of the shorter of two neighbouring
-#: sweeps that must overlap with the other one. REACH: shifts that are tried [decades].
+#: Settings for the first estimate of a shift. OVERLAP: two neighbouring sweeps must overlap over at least this fraction
+#: of the largest possible overlap. REACH: shifts that are tried [decades].
 OVERLAP, REACH = 0.25, np.linspace(-8.0, 8.0, 801)
-#: CHANCE: G' and G'' get different weights if the probability that their distances from the curves differ so much by
-#: chance is below this value. The same limit holds for the noise of the sweeps in the standard errors. LEAST_DEGREES:
-#: degrees of freedom needed to estimate the noise of a sweep. ROUNDS: maximum number of fits, each followed by new
-#: weights. SETTLED: the fits end if no weight changes by more than this fraction and no log a by more than this number.
-#: MOST: largest ratio of the weights.
+#: CHANCE: significance level. G' and G'' get different weights if their distances from the curves differ significantly.
+#: The standard errors contain the noise of each sweep if the noise of the sweeps differs significantly. LEAST_DEGREES:
+#: degrees of freedom that are needed to estimate the noise of a sweep. ROUNDS: maximum number of fits, each followed by
+#: new weights. SETTLED: the fits end if no weight changes by more than this fraction and no log a by more than this
+#: number. MOST: largest ratio of the weights.
 CHANCE, LEAST_DEGREES, ROUNDS, SETTLED, MOST = 1e-3, 3.0, 8, 0.02, 100.0
 #: Two sweeps match within the noise if their mean square distance, divided by the variance of their noise, is at most
 #: this value.
@@ -55,10 +55,10 @@ class Shifts(NamedTuple):
     log_b_errors: np.ndarray
     misfit: np.ndarray  # (K,) relative root mean square distance of each sweep from the curve
     points: np.ndarray  # (K,) number of points of each sweep
-    covariance: np.ndarray  # (K, K) of `log_a`; errors of neighbouring sweeps are correlated
+    covariance: np.ndarray  # (K, K) covariance of `log_a`; errors of neighbouring sweeps are correlated
     knots: float  # distance between two knots of the curve [decades]
     given: bool = False
-    weights: tuple[float, float] = (1.0, 1.0)  # of the distances in log G' and in log G''
+    weights: tuple[float, float] = (1.0, 1.0)  # weights of the distances in log G' and in log G''
 
     @property
     def apart(self) -> float:
@@ -100,7 +100,7 @@ def found(
 
 
 def _in_decades(sweeps: Sequence[Sweep]) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Return for each sweep the logarithms log10 of the angular frequencies [rad/s], of G' [Pa] and of G'' [Pa]."""
+    """Return three arrays for each sweep: log10 of the angular frequencies [rad/s], of G' [Pa] and of G'' [Pa]."""
     return [(np.log10(s.angular_frequency), np.log10(s.storage), np.log10(s.loss)) for s in sweeps]
 
 
@@ -114,7 +114,7 @@ def _points_of(sweeps: Sequence[Sweep]) -> np.ndarray:
 
 
 def _best(sweeps: Sequence[Sweep], every: list[Shifts], factors: int) -> Shifts:
-    """Return the result with the lowest corrected information criterion. If the data are too few to compute this
+    """Return the result with the lowest corrected information criterion. If there are too few data to compute this
     criterion for any result, return the result with the largest distance between knots. `factors`: number of fitted
     factors.
     """
@@ -139,8 +139,8 @@ def _squares_of_moduli(sweeps: Sequence[Sweep], own: Shifts) -> np.ndarray:
 
 
 def weighted_distance(sweeps: Sequence[Sweep], own: Shifts, weights: tuple[float, float]) -> float:
-    """Return the relative root mean square distance of all points from the curve. `weights` multiply the distances in
-    log G' and in log G''. With equal weights, the result is `Shifts.apart`."""
+    """Return the relative root mean square distance of all points from the curve. `weights` (2,) multiply the distances
+    in log G' and in log G''. With equal weights, the result is `Shifts.apart`."""
     return float(np.sqrt(np.average(_squares_of_moduli(sweeps, own), weights=np.square(weights))))
 
 
@@ -157,7 +157,7 @@ def _at_knots(
         sweeps: K sweeps.
         at: temperatures (K,) [K], and the index of the sweep that is not shifted.
         first: starting values of log a (K,) and log b (K,).
-        free: whether each log a and each log b is fitted (2, K).
+        free: mask (2, K) of the fitted factors: first row log a, second row log b.
         knots: distance between two knots [decades].
     """
     columns, counts = _in_decades(sweeps), _points_of(sweeps)
@@ -183,11 +183,12 @@ def _at_knots(
 def _by_least_squares(
     columns: list, first: tuple[np.ndarray, np.ndarray], free: np.ndarray, knots: float, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return log a (K,), log b (K,), and the matrix and the right-hand side of the last linear problem (method of
-    Levenberg and Marquardt). The matrix has columns only for the fitted factors and for the curves. `weights` (2,)
-    multiply the distances in log G' and in log G''. The other arguments are the same as for `_at_knots`."""
+    """Fit the factors by the method of Levenberg and Marquardt. Return log a (K,), log b (K,), and the matrix and the
+    right-hand side of the last linear problem. The matrix has columns only for the fitted factors and for the curves.
+    `weights` (2,) multiply the distances in log G' and in log G''. The other arguments are the same as for
+    `_at_knots`."""
     factors, damping = np.stack(first), DAMPING[0]
-    # The knots stay where they are during the iteration. Otherwise the sum of squares would change with them.
+    # The knots do not move during the iteration, because the sum of squares would change with their places.
     grid = _knot_grid(_shifted_places(columns, first[0]), knots)
     A, b = _linear_problem(columns, factors[0], factors[1], grid, weights)
     for _ in range(60):
@@ -213,7 +214,8 @@ def _free_columns(A: np.ndarray, free: np.ndarray) -> np.ndarray:
 
 
 def _damped_step(A: np.ndarray, b: np.ndarray, free: np.ndarray, damping: float) -> np.ndarray:
-    """Return the step (2, K) of the factors for the linear problem A, b. It is at most `LONGEST`."""
+    """Return the step (2, K) of the factors for the linear problem with matrix A and right-hand side b. No entry of the
+    step is larger than `LONGEST`."""
     own, step = _free_columns(A, free), np.zeros(free.shape)
     damp = np.sqrt(damping) * np.eye(int(free.sum()), own.shape[1])
     step[free] = np.linalg.lstsq(np.vstack([own, damp]), np.append(b, np.zeros(len(damp))), rcond=None)[0][: len(damp)]
@@ -222,7 +224,7 @@ def _damped_step(A: np.ndarray, b: np.ndarray, free: np.ndarray, damping: float)
 
 def _weights_of_moduli(distances: np.ndarray, degrees: float) -> np.ndarray:
     """Return the weights (2,) of log G' and of log G'', from the distances (2, n) of n points from their curves. The
-    weights are 1 unless the noise of the two moduli differs by more than chance explains.
+    weights are 1 unless the noise of the two moduli differs significantly (F-test, `CHANCE`).
 
     `degrees`: degrees of freedom of the distances of one modulus.
     """
@@ -248,8 +250,8 @@ def known_shifts(sweeps: Sequence[Sweep], temperatures: np.ndarray, reference: i
 
 
 def _gap(columns: list, log_a: np.ndarray) -> list[int] | None:
-    """Return the indices of the two sweeps next to a gap in frequency between the shifted sweeps, or None if there is
-    no gap. The data do not determine a shift across such a gap."""
+    """Return the indices of two sweeps with a gap between them: no shifted sweep has frequencies in the gap. Return
+    None if there is no gap. The data do not determine a shift across such a gap."""
     ends = [(c[0][0] + a, c[0][-1] + a) for c, a in zip(columns, log_a, strict=True)]
     order = sorted(range(len(ends)), key=lambda k: ends[k][0])
     last = order[0]
@@ -293,8 +295,8 @@ def size_of_curve(sweeps: Sequence[Sweep], log_a: np.ndarray, knots: float) -> i
 
 
 def _knot_grid(x: np.ndarray, apart: float) -> tuple[float, float]:
-    """Return the place of one knot, and the distance between two knots (at most `apart`) [decades], such that the first
-    and the last of the points x (n,) lie on knots."""
+    """Return the place of the first knot, and the distance between two knots (at most `apart`) [decades]. The first and
+    the last of the points x (n,) lie on knots (up to 1e-6)."""
     low, high = x.min() - 1e-6, x.max() + 1e-6
     return low, (high - low) / max(1, int(np.ceil((high - low) / apart)))
 
@@ -344,8 +346,8 @@ def _linear_problem(
 
 def _covariance(A: np.ndarray, b: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """Return the covariance of all unknowns. The first rows of A and b belong to G' of all K sweeps, and the next rows
-    to G''. The other rows are the penalty that keeps the curve smooth. If the noise of the sweeps differs by more than
-    chance explains, each sweep has its own noise. `counts` (K,): number of points of each sweep."""
+    to G''. The other rows are the penalty that keeps the curve smooth. If the noise of the sweeps differs significantly
+    (`_differ`), each sweep has its own noise. `counts` (K,): number of points of each sweep."""
     data, place = 2 * counts.sum(), np.tile(np.repeat(np.arange(len(counts)), counts), 2)
     inverse, squares = np.linalg.pinv(A)[:, :data], b[:data] ** 2
     leverages = np.einsum("nc,cn->n", A[:data], inverse)
@@ -359,8 +361,8 @@ def _covariance(A: np.ndarray, b: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 
 def _differ(variances: np.ndarray, degrees: np.ndarray) -> bool:
-    """Return whether variances (k,) with the given degrees of freedom (k,) differ by more than chance explains (test of
-    Bartlett 1937)."""
+    """Return whether variances (k,) with the given degrees of freedom (k,) differ significantly (test of Bartlett 1937,
+    `CHANCE`)."""
     if len(variances) < 2 or not variances.min() > 0:
         return False
     ratio = degrees.sum() * np.log(np.average(variances, weights=degrees)) - degrees @ np.log(variances)
@@ -369,7 +371,7 @@ def _differ(variances: np.ndarray, degrees: np.ndarray) -> bool:
 
 
 def _first_shifts(columns: list, temperatures: np.ndarray, reference: int) -> np.ndarray:
-    """Return starting values of the shifts of the K sweeps (K,) [decades]. Each sweep is matched to the sweep at the
+    """Return starting values of the shifts of the K sweeps (K,) [decades]. Each sweep is shifted onto the sweep at the
     neighbouring temperature, beginning at the reference temperature."""
     log_a = np.zeros(len(columns))
     for way in (range(reference + 1, len(columns)), range(reference - 1, -1, -1)):
@@ -390,8 +392,8 @@ def _over(fixed: tuple, moving: tuple) -> float | None:
     """Return the shift [decades] of the sweep `moving` at which this sweep is nearest to the neighbouring sweep
     `fixed`. Return None if the sweeps match at no shift.
 
-    If the sweeps match within the noise at several shifts, the shift with the longest overlap is used, because a few
-    points may match by chance at a wrong shift.
+    If the sweeps match within the noise at several shifts, the shift with the longest overlap is used. At a wrong
+    shift, a few points may match by chance.
     """
     best, where = (np.inf, 0), None
     noise = WITHIN * sum(_variance(c) for c in (fixed, moving))

@@ -13,13 +13,13 @@ import scipy.optimize
 
 from fitting.master.shifts import Shifts
 
-#: GAS: molar gas constant [J / (mol K)]. LEAST: additional standard error [decades] of log10 a_T. Its square is added
-#: to the variances of given shift factors. For fitted shift factors, a tenth of LEAST is used.
+#: GAS: molar gas constant [J / (mol K)]. LEAST: additional standard error [decades] of log10 a_T. The square of LEAST
+#: is added to the variances of given shift factors. For fitted shift factors, a tenth of LEAST is used.
 GAS, LEAST = 8.314462618, 0.01
 
 
 class TemperatureLaw(NamedTuple):
-    """A law for the temperature dependence with its fitted parameters, and the distance of the shift factors from this
+    """A law of the temperature dependence: its fitted parameters, and the distance of the shift factors from this
     law."""
 
     name: str
@@ -29,8 +29,8 @@ class TemperatureLaw(NamedTuple):
 
 
 def temperature_laws_of(shifts: Shifts) -> list[TemperatureLaw]:
-    """Fit the laws for which there are enough temperatures, and return the fitted laws, best fit first. The Arrhenius
-    law needs three temperatures, the WLF law four."""
+    """Fit each law if there are enough temperatures for it. Return the fitted laws, best fit first. The Arrhenius law
+    needs three temperatures, the WLF law four."""
     T = shifts.temperatures
     T0 = T[shifts.reference]
     if len(T) < 3:
@@ -43,9 +43,9 @@ def temperature_laws_of(shifts: Shifts) -> list[TemperatureLaw]:
 
 
 def _whitening(shifts: Shifts) -> np.ndarray:
-    """Return the whitening matrix W (K - 1, K) for the log shift factors of K sweeps: W times the errors of these
-    factors has independent entries with variance 1. The covariance is that of all factors except the reference, plus
-    the variance from `LEAST`."""
+    """Return the whitening matrix W (K - 1, K) for the log shift factors of K sweeps. If W is multiplied by the errors
+    of these factors, the entries of the product are independent with variance 1. The covariance of the errors contains
+    the variance from `LEAST`. The factor of the reference has no error."""
     free = np.arange(len(shifts.log_a)) != shifts.reference
     least = LEAST if shifts.given else 0.1 * LEAST
     C = shifts.covariance[np.ix_(free, free)] + least**2 * np.eye(free.sum())
@@ -53,8 +53,8 @@ def _whitening(shifts: Shifts) -> np.ndarray:
 
 
 def _noise(off: np.ndarray, numbers: int, given: bool) -> float:
-    """Return the factor that multiplies the covariance of the parameters of a law, computed from the whitened residuals
-    `off`. `numbers`: number of these parameters. The factor is at least 1, unless the shift factors were given."""
+    """Return the factor that multiplies the covariance of the parameters of a law. It is computed from the whitened
+    residuals `off`. `numbers`: number of parameters. The factor is at least 1, unless the shift factors were given."""
     found = float(off @ off) / max(1, len(off) - numbers)
     return found if given else max(1.0, found)
 
@@ -74,7 +74,7 @@ def _arrhenius(T: np.ndarray, T0: float, shifts: Shifts) -> TemperatureLaw:
 
 def _wlf(T: np.ndarray, T0: float, shifts: Shifts) -> TemperatureLaw | None:
     """Fit the WLF law. Return None if the fitted C1 is not between 0 and 1000, or if C2 is not below 10,000 K. This
-    happens if the curvature of log a_T over temperature has the opposite sign to that of the law."""
+    happens if the curve of log a_T over the temperature and the WLF law have curvatures of opposite sign."""
     W = _whitening(shifts)
 
     # C2 must stay above T0 minus the lowest temperature, because the law has a pole at T0 - C2.

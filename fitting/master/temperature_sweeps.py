@@ -15,13 +15,13 @@ from fitting.readers.rheometer import REPEATED, SORTED, read_all_sweeps
 from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
 
-#: Temperatures that differ by less than this [K] are regarded as one temperature, because the temperature of an
+#: Temperatures that differ by less than this value [K] count as one temperature, because the temperature of an
 #: instrument varies by some tenths of a kelvin.
 SAME = 1.0
-#: The measured temperatures of a table and the temperature in its name differ by at most this [K].
+#: Maximum difference [K] between the measured temperatures of a table and the temperature in its name.
 OFF_NAME = 5.0
 #: A temperature in the name of a table. A hyphen after a letter or a digit separates words ("Sweep-25C"), so it is not
-#: a minus sign. A value that a slash follows is a rate ("5 K/min").
+#: a minus sign. A value before a slash is a rate ("5 K/min").
 _STATED = re.compile(r"((?:(?<![^\W_])-)?\d+(?:[.,]\d+)?)\s*(°?)\s*([CK])\b(?!\s*/)")
 
 
@@ -34,15 +34,15 @@ class AtTemperatures(NamedTuple):
 
 
 def read_temperatures(paths: Sequence[Path]) -> AtTemperatures:
-    """Read all sweeps of the files, and join the sweeps at the same temperature.
+    """Read all sweeps of the files. Sweeps at the same temperature become one sweep.
 
     The temperature must be in a column (`temperature_C`, or `Temperature` with its unit) or in the name of the table. A
     column `shift_factor` may contain shift factors that are already known. Without such factors, temperatures with
     fewer than `FEWEST` frequencies are ignored.
 
     Raises:
-        InputError: a table states no temperature or several, there are fewer than two temperatures, or a temperature
-            or shift factor is not positive.
+        InputError: the temperature of a table or of some rows is unknown, there are fewer than two temperatures, or a
+            temperature [K] or shift factor is not positive.
     """
     parts: list[tuple[float, float, Sweep]] = []
     for path in paths:
@@ -79,8 +79,8 @@ def _with_enough_points(
 ) -> tuple[list[list[tuple[float, float, Sweep]]], list[str]]:
     """Return the groups (one for each temperature) with `FEWEST` or more frequencies, and a note on each other group.
 
-    One or two points at another temperature are often wrong readings of the temperature, and fewer points do not
-    determine a shift. All groups are returned if no shift is fitted, or if no group has enough frequencies.
+    One or two points at another temperature are often wrong readings of the temperature, and so few points do not
+    determine a shift. All groups are returned if all shift factors are given, or if no group has enough frequencies.
     """
     omegas = [np.unique(np.concatenate([p[2].angular_frequency for p in own])) for own in groups]
     few = [len(omega) < FEWEST for omega in omegas]
@@ -99,15 +99,16 @@ def _with_enough_points(
 def with_usable_points(
     data: AtTemperatures, band: tuple[float | None, float | None], radius: float | None, height: float | None
 ) -> AtTemperatures:
-    """Return the data without the points at which the instrument dominates, and without the points outside the band.
-    Notes say which points are ignored, and at which temperatures. A temperature is ignored if too few of its points
-    remain: fewer than `FEWEST` frequencies if shifts are fitted, or none if the shift factors are given.
+    """Return the data without the points where the inertia of the instrument dominates, and without the points outside
+    the band. Notes say which points are ignored, and at which temperatures. A temperature is ignored if too few of its
+    points remain. The minimum is `FEWEST` frequencies if shifts are fitted, and one frequency if the shift factors are
+    given.
 
     Args:
         data: sweeps that are not shifted.
-        band: lowest and highest measured frequency [Hz], or None. If the highest one is given, the points that show the
-            mark of the instrument (`without_instrument`) are kept, as in a fit of one sweep.
-        radius, height: of the sample [m], if they are known.
+        band: lowest and highest measured frequency [Hz], or None. If the highest frequency is given, points that the
+            instrument seems to falsify (`without_instrument`) are kept, as in a fit of one sweep.
+        radius, height: size of the sample [m], if known.
 
     Raises:
         InputError: fewer than two temperatures remain.
@@ -148,10 +149,12 @@ def _mean_factor(factors: np.ndarray) -> float:
 
 
 def _index_of_group(T: np.ndarray, exact: bool) -> np.ndarray:
-    """Return for each temperature (n,) [K] the index (n,) of its group, in ascending order of the temperatures.
+    """Divide the temperatures T (n,) [K] into groups, and return the index (n,) of the group of each. The groups are in
+    ascending order of the temperatures.
 
-    Exact temperatures that are `SAME` or more above the lowest one of a group begin the next group. Measured
-    temperatures scatter around an unknown value, so they begin the next group only after a gap of `SAME` or more.
+    If the temperatures are `exact`, a group ends before a temperature that is `SAME` or more above the lowest
+    temperature of this group. Measured temperatures scatter around an unknown value, so a group ends only before a gap
+    of `SAME` or more.
     """
     order = np.argsort(T, kind="stable")
     group, count, lowest = np.zeros(len(T), int), 0, T[order[0]]
@@ -163,9 +166,9 @@ def _index_of_group(T: np.ndarray, exact: bool) -> np.ndarray:
 
 
 def joined(sweeps: Sequence[Sweep]) -> Sweep:
-    """Return one sweep with all points of several sweeps, sorted by frequency. It has standard deviations and raw
-    columns if all sweeps have them. If no raw column of the instrument is in all sweeps, it has each of these columns,
-    with NaN for the other sweeps."""
+    """Return one sweep with all points of several sweeps, sorted by frequency. It has standard deviations if all sweeps
+    have them, and each raw column that all sweeps have. If the sweeps have no common raw column of the instrument
+    (`raw_torque.COLUMNS`), each such column is kept, with NaN for sweeps without this column."""
     omega = np.concatenate([s.angular_frequency for s in sweeps])
     order = np.argsort(omega, kind="stable")
     storage, loss = (np.concatenate([getattr(s, q) for s in sweeps])[order] for q in ("storage", "loss"))
@@ -206,8 +209,8 @@ def joined(sweeps: Sequence[Sweep]) -> Sweep:
 
 
 def temperatures_in(name: str) -> list[float]:
-    """Return the different temperatures [K] in the name of a table. Temperatures without the sign ° count only if none
-    has this sign."""
+    """Return the different temperatures [K] in the name of a table. Temperatures without the sign ° count only if no
+    temperature has this sign."""
     stated = _STATED.findall(name)
     chosen = [own for own in stated if own[1]] or stated
     every = [float(value.replace(",", ".")) + 273.15 * (unit == "C") for value, _, unit in chosen]
@@ -215,8 +218,7 @@ def temperatures_in(name: str) -> list[float]:
 
 
 def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, float, Sweep]]:
-    """Return (temperature [K], shift factor, points of the sweep) for each temperature in a table. The shift factor is
-    NaN if it is unknown."""
+    """Return (temperature [K], shift factor, sweep) for each temperature in a table. An unknown shift factor is NaN."""
     raw = sweep.raw or {}
     T = raw.get("temperature", np.full(len(sweep.storage), np.nan))
     missing = ~np.isfinite(T)
@@ -229,7 +231,8 @@ def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, flo
                 f"{f'several temperatures ({found})' if found else 'no temperature'}; add a column temperature_C"
             )
         of_name = stated[0] if len(stated) == 1 else np.nan
-        # The name cannot replace missing temperatures if the other rows differ from each other, or much from the name.
+        # The temperature in the name cannot replace missing temperatures in two cases: the known temperatures differ
+        # from each other, or they differ much from the name.
         known = T[~missing]
         if not np.isfinite(of_name) or (known.size and (np.ptp(known) >= SAME or np.ptp([*known, of_name]) > OFF_NAME)):
             raise InputError(

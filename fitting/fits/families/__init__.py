@@ -1,1 +1,1 @@
-"""Families of models besides free Prony modes, and the choice between all models."""
+"""Families of models other than free Prony modes, and the choice between all models."""

@@ -1,8 +1,9 @@
 """The choice between models of several families by their information criteria.
 
-A general model may contain a special case: for some values of its parameters, it equals the special case. It then fits
-the data at least as closely. It is chosen only if the criterion is strong evidence for it (Kass and Raftery 1995, J.
-Am. Stat. Assoc. 90). If the data do not need the general model, its predictions outside the measured band are worse.
+A general model may contain a special case: for some values of its parameters, the general model equals the special
+case. The general model then fits the data at least as closely as the special case. It is chosen only if the criterion
+is strong evidence for it (Kass and Raftery 1995, J. Am. Stat. Assoc. 90). If the data do not need the general model, it
+predicts less well outside the measured band than the special case.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,10 +20,10 @@ SPECIAL_CASES = {
     "fractional_parallel": ("springpot", "fractional_kelvin_voigt"),
     "fractional_zener": ("springpot", "fractional_kelvin_voigt"),
 }
-#: A model is chosen only if its criterion is lower than the criterion of its special case by at least this difference
-#: (strong evidence).
+#: A general model is chosen only if its criterion is lower than the criterion of its special case by at least this
+#: difference (strong evidence).
 GENERAL = 6.0
-#: Difference of the criterion that counts as very strong evidence (Kass and Raftery 1995).
+#: A difference of the criterion above this value is very strong evidence (Kass and Raftery 1995).
 STRONG = 10.0
 
 
@@ -60,7 +61,7 @@ def preferred(labels: Sequence[Label], criteria: Sequence[float]) -> int:
 
 def undecided(second: str, chosen: str, apart: float) -> str:
     """Return the warning that the data do not decide between the model `chosen` and the model `second`. `apart`: the
-    criterion of `second` minus that of `chosen`."""
+    criterion of `second` minus the criterion of `chosen`."""
     return (
         f"{second} explains the data about as well as {chosen} (criterion {abs(apart):.2g} "
         f"{'higher' if apart >= 0 else 'lower'}; {STRONG:g} is very strong evidence). The data do not decide between "

@@ -31,14 +31,14 @@ def unfollowed(curves: list[Curve], fits: list[LawFit]) -> list[str]:
     return told
 
 
-#: The stress of a curve has the same course as the stress of a law if the relative misfit is below this value after the
-#: stress of the law is multiplied by a factor.
+#: A curve and a law have the same course if their stresses differ only by a constant factor. The relative misfit that
+#: remains with this factor must be below this value.
 _SAME_COURSE = 0.1
 
 
 def _only_a_factor(law: laws.Law, curve: Curve, curves: list[Curve]) -> float | None:
-    """Return the factor between the measured stress of a curve and the stress of a law. Return None if their courses
-    differ too (`_SAME_COURSE`), or if no other curve in `curves` belongs to the same test."""
+    """Return the factor between the measured stress of a curve and the stress of a law. Return None if the curve and
+    the law do not have the same course (`_SAME_COURSE`), or if no other curve in `curves` belongs to the same test."""
     if sum((c.test, c.component) == (curve.test, curve.component) for c in curves) == 1:
         return None
     model = np.asarray(homogeneous.nominal_stress(law, jnp.asarray(curve.F), constant=True))[:, *curve.component]
@@ -70,8 +70,8 @@ def tied_laws(fits: Sequence[LawFit], data: str) -> list[str]:
 
 def too_few_points(fits: Sequence[LawFit], points: int) -> list[str]:
     """Return a warning if laws with more parameters may describe the curves better than the best law, but the curves
-    have too few points for the criterion of these laws. The best law comes first in `fits`. Laws with as many
-    parameters as points do not count, because they follow any data."""
+    have too few points to compute the criterion (AICc) of these laws. The best law comes first in `fits`. Laws with as
+    many parameters as points do not count, because they follow any data."""
     best = fits[0]
     closer = [f for f in fits if not np.isfinite(f.aicc) and f.bic < best.bic and len(f.values) < points]
     if not closer:

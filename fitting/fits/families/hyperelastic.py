@@ -1,4 +1,4 @@
-"""Hyperelastic laws as families of models: the parameters to be fitted, and starting points for the fit."""
+"""Hyperelastic laws that can be fitted: their fitted parameters, and starting points for the fit."""
 
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
@@ -41,7 +41,7 @@ def candidates(name: str, terms: int | None = None) -> list[Candidate]:
         raise InputError(f"--terms {terms} cannot be used with {name}, only with ogden: remove --terms")
     if name == "all":
         singles = [c for n in laws.LAWS if n != "ogden" and incompressible_form(n) for c in candidates(n)]
-        # By default, Ogden's law with one term is not added, because `singles` contains the equal law bogen.
+        # By default, Ogden's law with one term is not added. It is the same law as bogen, which `singles` contains.
         return singles + [_ogden(k) for k in ((2, 3) if terms is None else (terms,))]
     typical = gradient_check.load(name)
     if laws.isochoric_part(typical) is None:
@@ -64,14 +64,15 @@ def _candidate(label: str, law: Law) -> Candidate:
 
 def _sum(label: str, numbered: dict[int, Candidate]) -> Candidate:
     """Return the candidate for a sum of laws. The parameters have the same names as in a scene. For example, `1.mu` is
-    the parameter mu of the second law, and `2.mu.0` the first mu of the third law.
+    the parameter mu of the second law, and `2.mu.0` is the first mu of the third law.
 
     Args:
         label: label of the candidate.
-        numbered: place in the sum -> candidate. A law that has only U(J) has no candidate.
+        numbered: dictionary: place of a law in the sum -> candidate of this law. A law that has only U(J) has no
+            candidate.
     """
     parts = list(numbered.values())
-    ends = np.cumsum([len(p.names) for p in parts])[:-1]  # there are as many unconstrained variables as parameters
+    ends = np.cumsum([len(p.names) for p in parts])[:-1]  # each parameter has one unconstrained variable
 
     def values(u, scale):
         return jnp.concatenate([p.values(v, scale) for p, v in zip(parts, jnp.split(u, ends), strict=True)])
@@ -116,8 +117,8 @@ def _single(label: str, typical: Law) -> Candidate:
     def random(rng, n):
         near = np.log(np.abs(middle)) + 1.5 * rng.standard_normal((n, len(names)))
         u = np.where(positive, near, middle * np.exp(rng.standard_normal((n, len(names)))))
-        # An exponent alpha may be positive or negative, unless its bound is 0. The other parameters without this bound
-        # are coefficients and keep their signs.
+        # An exponent alpha without the bound `above=0` may be positive or negative. The other parameters without this
+        # bound are coefficients and keep their signs.
         alpha = np.array([m == "alpha" for m in names]) & ~positive
         return np.where(alpha, _exponents_of_law(rng, (n, len(names))), u)
 
@@ -129,13 +130,13 @@ def _single(label: str, typical: Law) -> Candidate:
 
 
 def out_of_bounds(candidate: Candidate, values: np.ndarray, limits: Collection[str]) -> list[str]:
-    """Return a warning for each fitted value that the bounds of its parameter do not allow. The fit considers only the
+    """Return a warning for each fitted value outside the bounds of its parameter. The fit itself considers only the
     bound `above=0`.
 
     Args:
         candidate: the fitted law.
         values: the values (p,) of its parameters.
-        limits: names of the parameters that went to a limit. They already have a warning.
+        limits: names of the parameters that went to a limit. These parameters already have a warning.
     """
     told = []
     for name, value, metadata in zip(candidate.names, values.tolist(), candidate.fields, strict=True):
@@ -151,8 +152,8 @@ def out_of_bounds(candidate: Candidate, values: np.ndarray, limits: Collection[s
 
 
 def _fitted(label: str, law: Law) -> tuple[list, tuple[str, ...]]:
-    """Return the parameters (fields) of the law that are fitted, and notes on the other parameters. A parameter is not
-    fitted if its value is 0 or missing.
+    """Return the fitted parameters (fields) of the law, and notes on the other parameters. A parameter is not fitted if
+    its value is 0 or missing.
 
     Raises:
         InputError: a parameter is a list, or no parameter is left to be fitted.

@@ -1,5 +1,4 @@
-"""Moduli at frequency zero and at infinite frequency, of a model and of the Prony modes that represent this model over
-the band.
+"""Moduli at frequency 0 and at infinite frequency: of a model, and of the Prony modes that represent this model.
 
 Springpots relax over many decades. Prony modes represent them only within the band of the data. At frequency 0 and at
 infinite frequency, the moduli of the modes therefore differ from the moduli of the model.
@@ -13,9 +12,9 @@ from fitting.methods.uncertainty import NO_REST, equilibrium_error
 
 #: The program warns if the difference between two moduli exceeds this many standard errors.
 TOLD = 2.0
-#: Limit for a ratio: the decrease of G' in the lowest half decade of the band, divided by that in the next half decade.
-#: Above this limit, the material may relax much more at lower frequencies. A material with one relaxation time well
-#: inside the band gives 0.1. A modulus that falls by the same amount in each half decade gives 1.
+#: Limit for the ratio of two decreases of G': in the lowest half decade of the band / in the next half decade. Above
+#: this limit, the material may relax much more at lower frequencies. A material with one relaxation time well inside
+#: the band gives 0.1. A modulus that falls by the same amount in each half decade gives 1.
 SLOWING = 0.5
 NAMES = {"shear_modulus": "instantaneous modulus", "equilibrium_modulus": "equilibrium modulus"}
 
@@ -23,7 +22,7 @@ NAMES = {"shear_modulus": "instantaneous modulus", "equilibrium_modulus": "equil
 def of_the_model(own: Estimate | None) -> dict[str, float]:
     """Return the moduli [Pa] of a model at infinite frequency and at frequency 0. The keys are the names of these
     moduli in fit.json. Infinite moduli, and the equilibrium modulus of a fluid, are not included. `own`: parameters of
-    the model; if None (Prony modes), the result is empty."""
+    the model. For Prony modes, `own` is None and the result is empty."""
     if own is None:
         return {}
     values = {name: float(value) for name, value in zip(own.names, own.values, strict=True)}
@@ -40,8 +39,8 @@ def of_the_modes(model: Maxwell) -> dict[str, float]:
 
 
 def equilibrium_of(model: Maxwell) -> float:
-    """Return the equilibrium modulus G0 (1 - sum g) [Pa] for the ratios g. It is 0 for a fluid, whose ratios add up to
-    1 except for roundoff."""
+    """Return the equilibrium modulus G0 (1 - sum g) [Pa] for the ratios g. For a fluid, the sum of g is 1 (except for
+    roundoff), and the result is 0."""
     rest = 1 - float(np.sum(np.asarray(model.ratios)))
     return float(model.shear_modulus) * rest if rest > NO_REST else 0.0
 
@@ -79,7 +78,7 @@ def still_relaxing(
         storage: G' (3,) of the model [Pa] at the lowest frequency, half a decade above it and one decade above it.
         noise: relative noise of the data.
         longest: longest relaxation time [s] of the model.
-        remedy: what the user can do, for the end of the warning.
+        remedy: end of the warning, which says what the user can do.
     """
     fall, next_fall = np.diff(storage)
     if fall <= max(TOLD * noise * storage[0], SLOWING * next_fall):

@@ -1,5 +1,5 @@
-"""Further models besides free Prony modes (springpots, a spectrum on a grid, fluids), and the choice between them. The
-moduli of all models are known in closed form, without simulation.
+"""Models other than Prony modes of a solid (springpots, a spectrum on a grid, fluids), and the choice between all
+models. The moduli of all models are known in closed form, without simulation.
 
 One information criterion is used both to compare the models and to choose the number of modes. For the simulation, each
 model is converted to Prony modes. The details of a fit contain the largest error of this conversion over the band.
@@ -33,10 +33,10 @@ SHARP = 1e-4
 
 
 def fractional(sweep: Sweep) -> list[Fit]:
-    """Fit every springpot model of `springpots.FRACTIONAL` to a sweep. Each fit is the best minimum from 24 starting
-    points."""
+    """Fit every springpot model of `springpots.FRACTIONAL` to a sweep. Each fit is the lowest minimum found from 24
+    starting points."""
     starts = springpots.starting_points(sweep)
-    # A model with as many parameters as data fits any data without residuals, so such a model is not fitted.
+    # A model with as many parameters as measured values fits any data without residuals, so it is not fitted.
     most = 2 * len(np.unique(sweep.angular_frequency))
     out = []
     for model in springpots.FRACTIONAL:
@@ -126,7 +126,7 @@ def _conversion(sweep: Sweep, moduli: Any, solid: bool) -> as_prony_modes.Conver
 
 
 def _finished(fit: Fit, made: as_prony_modes.Conversion) -> Fit:
-    """Return the fit with the error of the conversion to Prony modes, and with the warnings about the model."""
+    """Add two things to the fit: the error of the conversion to Prony modes, and the warnings about the model."""
     fit = fit._replace(details=fit.details | {"conversion": {"modes": fit.modes, "largest_relative_error": made.error}})
     return fit._replace(warnings=(*fit.warnings, *sentences_of_modes(fit), *undetermined(fit)))
 
@@ -151,7 +151,8 @@ def _has_spring(own: Estimate | None) -> bool:
 
 def limiting_moduli(fit: Fit) -> dict[str, float]:
     """Return the moduli [Pa] of the fitted model at frequency 0 (0 for a fluid) and at infinite frequency. An infinite
-    modulus is not included. If a springpot is a spring, the result contains the moduli of the Prony modes."""
+    modulus is not included. If a springpot is a spring (exponent 0), the result contains the moduli of the Prony
+    modes."""
     if fit.parameters is None or _has_spring(fit.parameters):
         return limits.of_the_modes(fit.model)
     return {"equilibrium_modulus": 0.0} | limits.of_the_model(fit.parameters)
@@ -191,8 +192,8 @@ def at_bounds(own: Estimate) -> list[str]:
 
 
 def determined(own: Estimate) -> np.ndarray:
-    """Return whether the data determine each parameter. A parameter is determined if its standard error is below half
-    its value, or if it is an exponent at 0 or 1."""
+    """Return whether the data determine each parameter. The data determine a parameter if its standard error is below
+    half its absolute value, or if the parameter is an exponent at 0 or 1."""
     return (own.standard_errors < 0.5 * np.abs(own.values)) | _bounded(own)
 
 
@@ -206,7 +207,7 @@ def _bounded(own: Estimate) -> np.ndarray:
 
 def identifiable(fit: Fit, sweep: Sweep) -> bool:
     """Return whether the fit converged and the data determine every parameter. For a spectrum, only the convergence is
-    checked, because the spectrum has a prior."""
+    checked: its prior determines the parameters that the data do not determine."""
     if fit.parameters is None:
         return viscoelastic.identifiable(fit, sweep)
     return fit.converged and (fit.kind.effective is not None or bool(np.all(determined(fit.parameters))))
@@ -254,7 +255,7 @@ def every_model(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) ->
 
 def best_of_models(tried: Sequence[Fit], sweep: Sweep) -> tuple[Fit, list[Fit]]:
     """Return the fit of the best model, and the fits of all models whose parameters the data determine. If there is no
-    such model, all of `tried` are compared and returned."""
+    such model, all fits in `tried` are compared and returned."""
     able = [fit for fit in tried if identifiable(fit, sweep)] or list(tried)
     return able[preferred([label_of(f) for f in able], [information_criterion(f) for f in able])], able
 
@@ -266,7 +267,7 @@ def choose(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) -> Fit:
     Args:
         sweep: data.
         model: one of `MODELS` except "prony".
-        prony: the best fit of Prony modes. If `model` is "auto", this fit is compared too.
+        prony: the best fit of Prony modes. It is compared only if `model` is "auto".
         dense: result of `generalised_maxwell.spectrum(sweep)`.
     """
     tried = every_model(sweep, model, prony, dense)
@@ -286,9 +287,9 @@ def _with_rivals(chosen: Fit, tried: list[Fit], sweep: Sweep) -> Fit:
 
 
 def rival_modes(chosen: Fit) -> Fit | None:
-    """Return the fit of free Prony modes with which `chosen` was compared, or None if there is no such fit. If a solid
-    and a fluid were compared, `preferred` selects one of them. The fit gets the table of the compared models, and the
-    time of their computation."""
+    """Return the fit of free Prony modes that was compared with `chosen`, or None if there is no such fit. If a solid
+    and a fluid were compared, `preferred` selects one of them. The returned fit contains the table of the compared
+    models and their computation time."""
     free = {fit.kind.name: fit for fit in chosen.rivals if fit.kind.values is None}
     if not free:
         return None
@@ -299,21 +300,23 @@ def rival_modes(chosen: Fit) -> Fit | None:
 
 
 def is_preferred(corrected: Fit, other: Fit, prior: float) -> bool:
-    """Return whether a fit with an error of the instrument is chosen, and not `other`, a fit of the uncorrected sweep.
-    `prior`: sum of squares of the errors of the instrument, in standard deviations of their priors."""
+    """Return whether the criterion prefers `corrected`, a fit with an error of the instrument, to `other`, a fit of the
+    uncorrected sweep. `prior`: each error of the instrument is divided by the standard deviation of its prior; `prior`
+    is the sum of the squares."""
     criteria = [information_criterion(corrected) + prior, information_criterion(other)]
     return preferred([label_of(corrected), label_of(other)], criteria) == 0
 
 
 def compared_again(chosen: Fit, sweep: Sweep, at_rest: Callable[[Fit], Fit]) -> Fit:
-    """Return the fit of free Prony modes with the other models, which are fitted again to a corrected sweep. Nothing is
-    fitted if the fit was not compared with other models before. The correction was found with the chosen model, so the
-    comparison favours this model.
+    """Fit the other models again, to a corrected sweep, and return `chosen` (free Prony modes) with these models as
+    rivals. If `chosen` was not compared with other models before, it is returned unchanged. The correction was found
+    with the chosen model, so the comparison favours this model.
 
     Args:
-        chosen: fit to the corrected sweep, with the table of the models that were fitted to the sweep before.
+        chosen: fit to the corrected sweep. Its details contain the table of the models that were compared before.
         sweep: the corrected sweep.
-        at_rest: function that returns a fit with the parameters of the sample at rest, as `chosen` has them.
+        at_rest: function that converts a fit to the parameters of the sample at rest. `chosen` already has these
+            parameters.
     """
     if TABLE_OF_MODELS not in chosen.details:
         return chosen
@@ -345,7 +348,7 @@ def _compared(sweep: Sweep, tried: list[Fit]) -> list[Content]:
 
 
 def _is_beaten(general: Fit, special: Fit) -> bool:
-    """Return whether the model `general` contains the model `special`, and the data do not need it (`preferred`)."""
+    """Return whether `general` contains the special case `special` and `preferred` chooses `special`."""
     labels, fits = [label_of(general), label_of(special)], (general, special)
     return contains(*labels) and preferred(labels, [information_criterion(f) for f in fits]) == 1
 
@@ -368,7 +371,7 @@ def _rival_models(chosen: Fit, tried: list[Fit], able: list[Fit]) -> list[str]:
     apart = information_criterion(second) - information_criterion(chosen)
     if apart >= STRONG:
         return out
-    if apart <= -STRONG:  # mostly if the data were corrected for an error that was fitted with the chosen model
+    if apart <= -STRONG:  # usual cause: the data were corrected for an error that was fitted with the chosen model
         return [
             *out,
             f"{second.kind.name} explains the data better than {chosen.kind.name} (criterion {-apart:.2g} "

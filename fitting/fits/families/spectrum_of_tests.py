@@ -1,9 +1,9 @@
-"""A smooth relaxation spectrum on a fixed grid of relaxation times, fitted to one relaxation or creep test or to
-several tests together.
+"""Fit a smooth relaxation spectrum on a fixed grid of relaxation times to one relaxation or creep test, or to several
+tests together.
 
-Stress is linear in the strengths of the spectrum, so one linear problem is enough for sweeps and relaxation tests
-(`relaxation_spectrum`). The strain in creep and the velocities of shear waves are not linear in the strengths. For such
-tests the linearised problem is solved repeatedly.
+For sweeps and relaxation tests, the predicted values are linear in the strengths of the spectrum, so one linear problem
+is enough (`relaxation_spectrum`). The strain in creep and the velocities of shear waves are not linear in the
+strengths. For such tests the linearised problem is solved repeatedly.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,10 +37,10 @@ STILL, NONE = 1e-9, 1e-12
 
 
 class SpectrumFit(NamedTuple):
-    """A spectrum with all results for the reports of tests."""
+    """A fitted spectrum, with all results that the reports of tests need."""
 
     kind: Kind
-    model: Maxwell  # few Prony modes that represent the spectrum
+    model: Maxwell  # a small number of Prony modes that represent the spectrum
     solution: Solution
     spread: Estimate  # parameters of these modes, with standard errors
     own: Estimate  # equilibrium modulus and strengths of the spectrum, with standard errors
@@ -50,7 +50,7 @@ class SpectrumFit(NamedTuple):
 
 def _modes_on_grid(grid: GridOfTimes) -> Callable[[np.ndarray], Maxwell]:
     """Return a NumPy function that computes Prony modes from x (…, 1 + K). x contains the equilibrium modulus and the
-    strengths at the K times of the grid, divided by `grid.unit`."""
+    strengths at the K times of the grid. All of them are divided by `grid.unit`."""
 
     def maxwell(x):
         strengths = grid.unit * (x + NONE)
@@ -101,14 +101,13 @@ def _minimum(kinds: list[str], data: list, grid: GridOfTimes, x: np.ndarray) -> 
 def spectrum_of(
     tests: Sequence[Measured], near: Maxwell, noise: np.ndarray
 ) -> tuple[GridSpectrum, GridOfTimes, _Minimum]:
-    """Return (spectrum, grid, minimum) for the grid and the weight of the smoothness term with the highest restricted
-    likelihood.
+    """Try several grids and several weights of the smoothness term. Return (spectrum, grid, minimum) for the grid and
+    the weight with the highest restricted likelihood.
 
     Args:
         tests: one or more tests.
-        near: Prony modes with about the same moduli as the tests. The strengths are scaled by the moduli of these
-            modes.
-        noise: relative noise of each test.
+        near: Prony modes whose moduli are about the moduli of the tests. These moduli are the units of the strengths.
+        noise: noise of each test, divided by its scales.
     """
     low, high = measured_tests.resolved_by(tests)
     kinds, data = list(map(measured_tests.name_of, tests)), _weighed_parts(tests, noise)
@@ -137,7 +136,7 @@ def _weighed_parts(tests: Sequence[Measured], noise: np.ndarray) -> list:
 def _as_a_fit(
     tests: Sequence[Measured], grid: GridOfTimes, found: _Minimum, told: GridSpectrum, over: Callable | None = None
 ) -> SpectrumFit:
-    """Return the spectrum `told` as a fit. `over`: function that divides the residuals at the minimum by their noise.
+    """Return the spectrum `told` as a fit. `over`: function that divides the residuals of a `Solution` by their noise.
     If `over` is None, the noise is estimated from the residuals."""
     low, high = measured_tests.resolved_by(tests)
     kept = found.x[1:] > 1e-10 * found.x.max()
@@ -188,8 +187,8 @@ def _as_a_fit(
 
 
 def _relative_scale(test: Measured) -> float:
-    """Return the median of the scales of a test, divided by the measured values (`sizes_of`). For a sweep, it
-    is the median of G' only."""
+    """Divide the scales of a test by its measured values (`sizes_of`), and return the median. For a sweep, use the
+    values of G' only."""
     _, y, scales = measured_tests.reported_numbers(test)
     count = len(y) // 2 if isinstance(test, Sweep) else len(y)
     return float(np.median((scales / measured_tests.sizes_of(test))[:count]))
@@ -197,7 +196,7 @@ def _relative_scale(test: Measured) -> float:
 
 def _still_relaxing(tests: Sequence[Measured], told: GridSpectrum, noises: np.ndarray) -> tuple[str, ...]:
     """Return a warning if G' of the spectrum still decreases at the lowest frequency that the tests resolve. `noises`:
-    noise of each test, relative to its scales."""
+    noise of each test, divided by its scales."""
     longest = int(np.argmax([t.resolved[1] for t in tests]))
     lowest = 1 / tests[longest].resolved[1] * np.sqrt(10.0) ** np.arange(3)
     columns = generalised_maxwell.mode_columns(lowest, told.times)[:3, 1:]
@@ -221,8 +220,8 @@ def spectrum_in_time(test: TimeTest, near: Maxwell) -> TimeFit:
 
 
 def spectrum_together(tests: list[Measured], near: Maxwell, noise: np.ndarray) -> Together:
-    """Fit one smooth spectrum to several tests. Each test has its individual noise level. `near` and `noise` are the
-    same as in `spectrum_of`."""
+    """Fit one smooth spectrum to several tests. Each test has its own noise level. `near` and `noise` are the same as
+    in `spectrum_of`."""
     parts = [measured_tests.reported_numbers(t) for t in tests]
     for _ in range(2):
         told, grid, found = spectrum_of(tests, near, noise)

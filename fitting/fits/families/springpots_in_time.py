@@ -1,8 +1,8 @@
-"""Springpot models for relaxation and creep tests and for several tests together, and the choice between all models.
+"""Springpot models for relaxation and creep tests and for several tests together. Choice between all models.
 
 The response of a springpot model is computed with many modes of its relaxation spectrum (`springpots.as_modes`). So the
-response to any load is computed in the same way as for Prony modes. The fit varies and reports only the few parameters
-of the springpot model.
+response to any load is computed in the same way as for Prony modes. The fit varies and reports only the parameters of
+the springpot model, not these modes.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,17 +35,17 @@ from fitting.readers.frequency_sweep import Sweep
 from fitting.readers.time_tests import TimeTest
 from liverjax.core.struct import Content
 
-#: STARTS: number of starting points for each model. The first starting point comes from Prony modes. AROUND: standard
-#: deviation of the other, random starting points around the first. MOST_STEPS: maximum number of iterations.
+#: STARTS: number of starting points for each model. The first starting point is computed from Prony modes. AROUND:
+#: standard deviation of the other, random starting points around the first. MOST_STEPS: maximum number of iterations.
 STARTS, AROUND, MOST_STEPS = 10, 1.0, 80
-#: An exponent is a logistic function of its variable. If the size of this variable is above MOST_LOGIT, the derivative
-#: is too small for the first step of a search.
+#: An exponent is a logistic function of its variable. If the absolute value of this variable is above MOST_LOGIT, the
+#: derivative of the exponent is too small for the first step of a search.
 MOST_LOGIT = 2.0
 
 
 class Spans(NamedTuple):
-    """Times [s] of the modes that represent springpots, and the frequency [rad/s] to which the parameters of the
-    springpots refer."""
+    """Relaxation times [s] of the modes that represent springpots, and the reference frequency [rad/s] of the variables
+    of the springpots."""
 
     low: float  # shortest time [s] that the tests resolve
     high: float  # longest time [s] that the tests resolve
@@ -54,7 +54,8 @@ class Spans(NamedTuple):
 
 
 def spans_of(tests: Sequence[Measured]) -> Spans:
-    """Return the times of the modes and the reference frequency, for the range of times that the tests resolve."""
+    """Return the relaxation times of the modes and the reference frequency. Both follow from the range of times that
+    the tests resolve."""
     low, high = measured_tests.resolved_by(tests)
     return Spans(low, high, springpots.times_of_modes(low, high), float(1 / np.sqrt(low * high)))
 
@@ -70,8 +71,8 @@ def _dense_modes(case: Fractional, spans: Spans) -> Callable[[Array], Maxwell]:
 
 
 def residuals_of_springpot(name: str, test: TimeTest) -> Callable[[jax.Array], jax.Array]:
-    """Return a JAX function from the variables u of the springpot model `name` to the residuals (m,) of the m measured
-    values of a relaxation or creep test."""
+    """Return a JAX function of the variables u of the springpot model `name`. The function computes the residuals (m,)
+    of the m measured values of a relaxation or creep test."""
     (case,) = (c for c in FRACTIONAL if c.name == name)
     maxwell, (at, measured, scales) = _dense_modes(case, spans_of([test])), measured_tests.reported_numbers(test)
 
@@ -82,11 +83,11 @@ def residuals_of_springpot(name: str, test: TimeTest) -> Callable[[jax.Array], j
 
 
 def _minimum_of_case(case: Fractional, tests: Sequence[Measured], starts: np.ndarray, data: list) -> Solution:
-    """Return the best minimum of the springpot model `case` for one or more tests, from S starting points (S, P) of its
-    P variables.
+    """Fit the springpot model `case` to one or more tests, from S starting points `starts` (S, P) of its P variables.
+    Return the lowest minimum.
 
-    `data`: for each test, the arrays from which it is predicted, its measured values, and the divisors of its
-    residuals.
+    `data`: for each test, three entries: the arrays from which the test is predicted, the measured values, and the
+    divisors of the residuals.
     """
     kind = Kind(case.name, _dense_modes(case, spans_of(tests)))
     evaluate = partial(residuals_of_tests.tests_evaluated, list(map(measured_tests.name_of, tests)), kind)
@@ -114,12 +115,12 @@ class _Springpot(NamedTuple):
 
     case: Fractional
     kind: Kind
-    model: Maxwell  # few Prony modes that represent the springpot model
+    model: Maxwell  # a small number of Prony modes that represent the springpot model
     solution: Solution
     spread: Estimate  # parameters of the Prony modes
     own: Estimate  # parameters of the springpot model
     sentences: tuple[str, ...]
-    error: float  # largest relative error of the few Prony modes over the band
+    error: float  # largest relative error of `model` over the band
 
 
 def _springpot_at(case: Fractional, solution: Solution, spans: Spans, over_noise: bool) -> _Springpot:
@@ -157,7 +158,7 @@ def _springpot_at(case: Fractional, solution: Solution, spans: Spans, over_noise
 
 def able(fit: TimeFit | Together, data: uncertainty.Band) -> bool:
     """Return whether the fit converged and the data determine every parameter. For a spectrum, only the convergence is
-    checked, because the spectrum has a prior."""
+    checked: its prior determines the parameters that the data do not determine."""
     if fit.parameters is not None:
         return fit.converged and (fit.kind.effective is not None or bool(np.all(models.determined(fit.parameters))))
     return fit.converged and not uncertainty.superfluous(data, fit.uncertainty)
@@ -237,9 +238,9 @@ def _compared_models(tried: Sequence, criterion: Callable, data: uncertainty.Ban
 
 
 def _with_other_kind(rows: list[Content], prony: AFit, tried: list[Content]) -> list[Content]:
-    """Return the table of compared models with one more row: the best fluid if `prony` is a solid, or the best solid if
-    `prony` is a fluid. No row is added if no such fit was tried, or if the test determines no such fit. `tried`: the
-    table of all fits from which `prony` was chosen."""
+    """Add one row to the table of compared models: the best fluid if `prony` is a solid, or the best solid if `prony`
+    is a fluid. No row is added if no such fit was tried, or if the data do not determine the parameters of any such
+    fit. `tried`: the table of all fits that were tried before `prony` was chosen."""
     others = [row for row in tried if row["model"] != prony.kind.name and row["identifiable"]]
     if not others:
         return rows
@@ -253,9 +254,9 @@ def _with_other_kind(rows: list[Content], prony: AFit, tried: list[Content]) -> 
     return sorted(rows, key=lambda row: row["above_the_lowest"])
 
 
-#: Tests with fewer measured values are not checked for noise of constant size.
+#: A test with fewer measured values is not checked for noise with a constant standard deviation.
 _ENOUGH = 10
-#: Fields of a fit that are computing times [s].
+#: Names of the fields of a fit that contain computing times [s].
 TIMES = ("run_time", "compile_time")
 
 
@@ -274,8 +275,8 @@ def _cautions_in_time(fit: TimeFit) -> list[str]:
 
 
 def fractional_together(tests: list[Measured], near: Maxwell) -> list[Together]:
-    """Fit every springpot model to several tests. Each test has its individual noise level. `near`: Prony modes that
-    give the starting points."""
+    """Fit every springpot model to several tests. Each test has its own noise level. `near`: Prony modes that give the
+    starting points."""
     spans, parts = spans_of(tests), [measured_tests.reported_numbers(t) for t in tests]
     out = []
     for case, starts in zip(FRACTIONAL, _starts_near(near, spans), strict=True):
@@ -305,11 +306,11 @@ def choose_together(
     progress: Callable[[str], None] = lambda text: None,
     relative: float | np.ndarray = 0.0,
 ) -> Together:
-    """Return the fit of several tests with the lowest information criterion. The arguments `model` and `modes` are
-    those of `choose_in_time`, and `progress` is that of `common_fit.fit`.
+    """Return the fit of several tests with the lowest information criterion. `model` and `modes` are the same as in
+    `choose_in_time`, and `progress` is the same as in `common_fit.fit`.
 
-    `relative`: relative errors (K,) of all moduli of the K tests due to the sizes of their samples, or one number for
-    all tests.
+    `relative`: relative errors (K,) of the moduli of the K tests, caused by errors in the sizes of the samples. One
+    number means the same error for all tests.
     """
     tests = [_by_its_noise(test) for test in tests]
     prony = common_fit.fit(tests, modes, progress)
@@ -321,8 +322,8 @@ def choose_together(
 
 
 def _by_its_noise(test: Measured) -> Measured:
-    """Return the test. If it is a relaxation or creep test with enough values and with noise of a constant size, its
-    `constant_noise` is set to True."""
+    """Return the test. For a relaxation or creep test with enough values, set `constant_noise` to True if the noise has
+    a constant standard deviation."""
     if not isinstance(test, TimeTest) or np.sum(test.used) < _ENOUGH:
         return test
     return fitted_by_its_noise(test)[0]
@@ -352,15 +353,15 @@ def _best_of_models(tests: list[Measured], model: str, prony: Together, progress
     out = [*best.warnings] if best.converged else ["the fit did not converge: try another --model", *best.warnings]
     out += doubts.disagreements(best.shares, "try another --model")
     out += doubts.missed(best.shares)
-    out += doubts.of_rises(prony)  # its relaxation times show whether the material relaxes during the rise
+    out += doubts.of_rises(prony)  # the relaxation times of `prony` show whether the material relaxes during the rise
     out += doubts.structured(best)
     out += models.undetermined(best)
     return best._replace(tried=rows, warnings=tuple(out), **seconds)
 
 
 def _shares_of_springpots(fit: Together) -> list[Share]:
-    """Return the contribution of each test to the common fit: the standard errors of the springpot parameters if this
-    test is left out, and the misfit of a fit to this test alone."""
+    """Return the contribution of each test to the common fit. It contains the standard errors of the springpot
+    parameters without this test, and the misfit of a fit to this test alone."""
     (case,) = (c for c in FRACTIONAL if c.name == fit.kind.name)
     parts = [measured_tests.reported_numbers(t) for t in fit.tests]
     assert fit.kind.values is not None and fit.parameters is not None

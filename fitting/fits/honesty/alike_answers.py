@@ -17,17 +17,17 @@ from fitting.methods.noise.alike_noise import alike_noise
 from fitting.methods.noise.uneven_noise import probability_of_sizes, uneven_root
 from fitting.readers.time_tests import TimeTest
 
-#: Standard errors computed from the size of each residual are used if they exceed the standard errors for noise of
-#: equal size by this factor.
+#: A standard error can be computed from the size of each residual, or for noise of equal size. The first is used if it
+#: exceeds the second by this factor.
 _UNEVEN_FROM = 1.3
 
 
 def fitted_by_its_noise(test: TimeTest, modes: int | str = "auto") -> tuple[TimeTest, TimeFit]:
-    """Return the test and the fit of its Prony modes. `constant_noise` of the returned test is True if the noise has
-    the same standard deviation at all measured values.
+    """Fit Prony modes to a test, and return the test and the fit. `constant_noise` of the returned test is True if the
+    noise has the same standard deviation at all measured values.
 
-    The first fit assumes noise that is proportional to the measured values. If the residuals show noise of a constant
-    size instead, the test is fitted again with equal scales, because small values had too much weight in the first fit.
+    The first fit assumes noise that is proportional to the measured values. If the residuals show a constant standard
+    deviation instead, small values had too much weight. Then the test is fitted again with equal scales.
     """
     fit = time_tests.fit(test, modes)
     if test.constant_noise or not _has_constant_noise(fit):
@@ -38,7 +38,7 @@ def fitted_by_its_noise(test: TimeTest, modes: int | str = "auto") -> tuple[Time
 
 def _has_constant_noise(fit: TimeFit) -> bool:
     """Return whether the residuals are noise with a constant standard deviation. The result is False if the residuals
-    have a structure, because they then do not show the noise."""
+    have a structure, because such residuals are not noise."""
     if not (fit.converged and fit.uncertainty.noise > 0 and np.all(np.isfinite(fit.uncertainty.standard_errors))):
         return False
     if fit.relative_errors.max() <= viscoelastic.EXACT or time_tests.structured_misfit(fit):
@@ -64,17 +64,18 @@ def with_own_noise(fit: TimeFit) -> TimeFit:
 
 
 def _has_errors_of_noise(fit: TimeFit) -> bool:
-    """Return whether some standard errors are known, and come from noise only. Some of the others may be infinite, for
-    example that of an exponent at its bound. The errors of a spectrum come from its prior too."""
+    """Return whether at least one standard error is finite, and whether noise alone causes the standard errors. Other
+    standard errors may be infinite, for example the error of an exponent at its bound. For a spectrum the result is
+    False, because its errors depend on its prior too."""
     numbers = fit.parameters or fit.uncertainty
     known = np.all(np.isfinite(numbers.values)) and np.any(np.isfinite(numbers.standard_errors))
     return bool(known and fit.kind.effective is None and fit.uncertainty.noise > 0)
 
 
 def _at_least(estimate: Estimate, root: np.ndarray) -> Estimate:
-    """Return the estimate, in which some standard errors are replaced by larger ones from a second covariance. `root`
-    (P, k) is the square root of this covariance of the P parameters, with k columns. A standard error is replaced if
-    the second covariance gives a value more than `_UNEVEN_FROM` times larger."""
+    """Replace some standard errors of the estimate by larger standard errors from a second covariance. `root` (P, k) is
+    the square root of this covariance of the P parameters, with k columns. A standard error is replaced if the new
+    value is more than `_UNEVEN_FROM` times larger."""
     ratio = np.linalg.norm(root, axis=1) / np.where(estimate.standard_errors > 0, estimate.standard_errors, np.inf)
     factor = np.where(np.isfinite(ratio) & (ratio > _UNEVEN_FROM), ratio, 1.0)
     return estimate._replace(
@@ -87,7 +88,7 @@ def with_alike_noise(fit: TimeFit) -> TimeFit:
     show such noise.
 
     Two kinds of correlation are tested. The correlation may decrease with the distance in time, for example in a drift.
-    Or the correlation may decrease with the number of measured values in between, for example if the instrument
+    Or the correlation may decrease with the number of measured values between two values, for example if the instrument
     averages or the model lacks a part of the spectrum. The more probable kind of correlation is used.
     """
     r, J = np.asarray(fit.solution.residuals), np.asarray(fit.solution.jacobian)
@@ -123,16 +124,16 @@ def _modes_of(fit: TimeFit | Together) -> Callable:
     return partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell)
 
 
-#: Noise of constant size is compared with noise that is proportional to the response. Constant size is assumed if the
-#: log of its probability is larger by more than this value.
+#: Noise of constant size is compared with noise that is proportional to the response. Constant size is assumed if its
+#: log probability is larger than the other log probability by more than this value.
 _CONSTANT = 3.0
 
 
 def _sizes(fit: TimeFit, r: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Return the standard deviations of the m residuals r (m,), and whether the noise has a constant size. Otherwise
-    the standard deviation of the noise is proportional to the measured response. The residuals decide which case is
-    more probable. J: derivatives (m, p) of the residuals with respect to the p unknowns."""
-    # The scales are computed from measured values, so they may contain noise, which would disturb the comparison. So
+    """Return the standard deviations of the m residuals r (m,), and whether the noise has a constant standard
+    deviation. The alternative is a standard deviation that is proportional to the measured response. The residuals
+    decide which case is more probable. J: derivatives (m, p) of the residuals with respect to the p unknowns."""
+    # The scales are computed from measured values, so they contain noise. This noise would disturb the comparison. So
     # the fitted values replace the measured values here. The lower bound of the scales is the same for all values.
     if np.ptp(fit.scales) == 0:  # the fit already assumes constant noise
         equal = np.ones(len(r))
@@ -149,8 +150,8 @@ def _of_such_noise(
     estimate: Estimate, natural_of: Callable, u: np.ndarray, root: np.ndarray, independent: float | None = None
 ) -> Estimate:
     """Return the estimate with standard errors from another covariance of the p unknowns u. `natural_of`: function from
-    u to the parameters. `root` (p, k): square root of this covariance, with k columns. `independent`: number of
-    independent residuals, or None if it does not change."""
+    u to the parameters. `root` (p, k): square root of this covariance, with k columns. `independent`: new number of
+    independent residuals. None: this number does not change."""
     root = host.with_jacobian(natural_of, u)[1] @ root
     errors, correlation = errors_and_correlation(root)
     errors = np.where(np.isfinite(estimate.standard_errors), errors, np.inf)
@@ -164,16 +165,16 @@ AFit = TypeVar("AFit", TimeFit, Together)
 
 
 def with_offset_errors(fit: AFit, tests: Sequence[Measured], factors: Sequence[float]) -> tuple[AFit, float]:
-    """Return (fit, error): the fit with larger standard errors, which also contain the errors of the sensor offsets
-    and drifts that were subtracted from the data.
+    """Return (fit, error). The standard errors of this fit also contain the errors of the base lines: the sensor
+    offsets and drifts that were subtracted from the data.
 
-    `error` is the standard error [Pa] of the equilibrium modulus due to these base lines alone. All measured values of
-    a test contain the same error of the base line, so more measured values do not make this standard error smaller.
+    `error` is the standard error [Pa] of the equilibrium modulus due to the base lines alone. All measured values of a
+    test contain the same error of the base line, so more measured values do not make this standard error smaller.
 
     Args:
         fit: the fit of these tests.
         tests: one or more tests.
-        factors: for each test, the factor by which the fit multiplied its scales.
+        factors: for each test, the factor that multiplied its scales in the fit.
     """
     J, u, row, columns = np.asarray(fit.solution.jacobian), np.asarray(fit.solution.u), 0, []
     for test, factor in zip(tests, factors, strict=True):

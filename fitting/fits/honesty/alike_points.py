@@ -14,13 +14,13 @@ from fitting.methods.estimate import Estimate, errors_and_correlation, freedom_o
 from fitting.methods.noise.alike_noise import LOST, Alike, along_rows
 from fitting.readers.frequency_sweep import Sweep, mostly_repeated
 
-#: Key in `Fit.details`: the number of moduli with independent noise that carry the same information as the measured
+#: Key in `Fit.details` of a number N: N moduli with independent noise carry the same information as the measured
 #: moduli.
 INDEPENDENT = "independent_moduli"
-#: Key in `Fit.details`: the standard errors of the parameters for independent noise, by name.
+#: Key in `Fit.details` of the standard errors for independent noise, by names of the parameters.
 OF_INDEPENDENT = "errors_of_independent_noise"
-#: Words of the warning about structured residuals, if the noise of neighbouring frequencies is correlated. They state
-#: that the standard errors include this noise.
+#: Words in the warning about structured residuals, if the noise of neighbouring frequencies is correlated. The words
+#: say that the standard errors include this noise.
 CONTAINED = "the standard errors contain it, as correlated noise of neighbours"
 #: First words of the warning about noise that is correlated between neighbouring frequencies.
 SHARED = "the noise of neighbouring frequencies is correlated"
@@ -41,7 +41,7 @@ def with_alike_points(fit: Fit, sweep: Sweep) -> Fit:
         f"{alike.independent:.0f} independent moduli; the standard errors include this effect"
     )
     fluid = uncertainty.like_a_fluid(modes, uncertainty.LOWER) if fit.kind.name == "prony" else []
-    # The fit may already have the warning about a fluid, which was then given for the smaller errors.
+    # The fit may already have the warning about a fluid, from the smaller errors before this correction.
     fluid = [] if any("(a fluid)" in w for w in fit.warnings) else fluid
     details = fit.details | {INDEPENDENT: float(alike.independent)}
     return fit._replace(uncertainty=modes, parameters=own, warnings=(*fit.warnings, *fluid, told), details=details)
@@ -52,8 +52,7 @@ def alike_of(fit: Fit) -> Alike | None:
     if the residuals show no such noise. Points with the same frequency count as neighbours, so only few frequencies may
     occur twice.
 
-    The function also returns None for exact data, and for spectra, because the errors of a spectrum come from a prior
-    too.
+    The function also returns None for exact data and for spectra. The errors of a spectrum depend on its prior too.
     """
     r, J, n = np.asarray(fit.solution.residuals), np.asarray(fit.solution.jacobian), len(fit.storage)
     numbers = fit.parameters or fit.uncertainty
@@ -67,9 +66,9 @@ def alike_of(fit: Fit) -> Alike | None:
 
 
 def with_weights_shown(fit: Fit, sweep: Sweep) -> Sweep:
-    """Return the sweep with weights for the noise of G' and G'' that the residuals show. The sweep is unchanged if all
-    values have the same relative noise, or if standard deviations are given. It is also unchanged if neighbouring
-    residuals are correlated, because they may then be a misfit of the model."""
+    """Return the sweep with new weights, from the noise of G' and G'' that the residuals show. The sweep is unchanged
+    if all values have the same relative noise, or if standard deviations are given. It is also unchanged if
+    neighbouring residuals are correlated, because such residuals may be a misfit of the model."""
     sizes = None if INDEPENDENT in fit.details else sizes_of_noise(fit, sweep)
     if sizes is None:
         return sweep
@@ -79,7 +78,7 @@ def with_weights_shown(fit: Fit, sweep: Sweep) -> Sweep:
 
 def not_below(estimate: Estimate, natural_of: Callable, u: np.ndarray, alike: Alike) -> Estimate:
     """Return the estimate with standard errors and degrees of freedom for correlated noise. The error of a parameter
-    due to noise is replaced only if correlated noise gives a larger error. Errors that are common to all points do not
+    due to noise changes only if correlated noise gives a larger error. Errors that are common to all points do not
     change.
 
     Args:

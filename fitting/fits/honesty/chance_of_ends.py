@@ -1,4 +1,4 @@
-"""Change of the fitted parameters due to noise alone, if a fit excludes the points at one end of the band."""
+"""Change of the fitted parameters if a fit excludes the points at one end of the band: the part due to noise alone."""
 
 from functools import partial
 
@@ -15,14 +15,15 @@ from fitting.readers.rheometer import Sweep
 
 #: Probability that noise alone causes a warning about the ends of the band.
 CHANCE = 0.05
-#: SMOOTH: if the points scatter about a smooth curve by less than this fraction of the residuals, an inadequate model
-#: causes the residuals. ENOUGH: minimum number of points for this comparison.
+#: SMOOTH: if the scatter of the points about a smooth curve is below this fraction of the residuals, the residuals are
+#: not noise (the model is inadequate). ENOUGH: minimum number of points for this comparison.
 SMOOTH, ENOUGH = 0.5, 16
 
 
 def moved_by_noise(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float]:
-    """Return, for each parameter of `edges.values`, the standard deviation of its change due to noise alone. The change
-    is that from `fit` to a second fit of only the points `kept` (n,) of the n points (first-order estimate).
+    """Return the standard deviation of the change of each parameter in `edges.values` due to noise alone. The change is
+    the difference between two fits: `fit` to all n points, and a fit to only the points `kept` (n,). All results are
+    first-order estimates.
 
     Both fits contain the kept points, so their errors are correlated. Therefore the function computes the variance of
     the difference between the two fits, not the variance of the second fit.
@@ -31,7 +32,7 @@ def moved_by_noise(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float]
     points = 2 * len(kept)
     if not (np.all(np.isfinite(J)) and len(J) >= points and len(kept) == len(fit.storage)):
         return dict.fromkeys(names, 0.0)
-    rows = np.concatenate([kept, kept, np.ones(len(J) - points, bool)])  # residuals of a prior are always kept
+    rows = np.concatenate([kept, kept, np.ones(len(J) - points, bool)])  # the residuals of the prior are always kept
     scale = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
     change = -np.linalg.pinv(J / scale)
     change[:, rows] += np.linalg.pinv(J[rows] / scale)
@@ -40,8 +41,8 @@ def moved_by_noise(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float]
 
 
 def farthest_by_chance(fit: Fit | TimeFit, numbers: int) -> float:
-    """Return a quantile of Student's t. Due to noise alone, the largest change at the two ends, divided by its standard
-    deviation, exceeds this quantile in at most the fraction `CHANCE` of all fits.
+    """Return a quantile of Student's t. Each change at the two ends is divided by its standard deviation. Noise alone
+    makes the largest of these ratios exceed the quantile with a probability of at most `CHANCE`.
 
     Args:
         fit: the fit whose residuals give the noise.
@@ -52,7 +53,7 @@ def farthest_by_chance(fit: Fit | TimeFit, numbers: int) -> float:
 
 def _slopes_of_reported(fit: Fit) -> tuple[list[str], np.ndarray]:
     """Return the names of the P reported parameters, and their derivatives (P, p) with respect to the p unknowns u. For
-    a compressed sample, the parameters are those of the sample at rest."""
+    a compressed sample, these are the parameters of the sample at rest."""
     u = np.asarray(fit.solution.u)
     if fit.parameters is not None:
         assert fit.kind.values is not None
@@ -78,7 +79,7 @@ def _as_reported(slope: np.ndarray, natural: np.ndarray, reported: np.ndarray) -
 
 def _noise_of_residuals(fit: Fit, sweep: Sweep, J: np.ndarray) -> np.ndarray:
     """Return the standard deviations (2n,) of the noise of G' and G'' at n frequencies, divided by the scales of the
-    residuals. Residuals that are smooth from point to point are not counted as noise."""
+    residuals. Residuals that lie on a smooth curve over the frequency do not count as noise."""
     r, n = np.asarray(fit.solution.residuals)[: len(J)], len(J) // 2
     own = None if fit.kind.effective is not None else sizes_shown(J, r, np.concatenate(sweep.deviations))
     sizes = np.full(2 * n, fit.uncertainty.noise) if own is None else own
@@ -87,7 +88,7 @@ def _noise_of_residuals(fit: Fit, sweep: Sweep, J: np.ndarray) -> np.ndarray:
         return sizes
     columns = ((sweep.storage, slice(0, n)), (sweep.loss, slice(n, 2 * n)))
     for (modulus, rows), deviation in zip(columns, sweep.deviations, strict=True):
-        # Noise of one size in Pa has no single relative size, so the typical relative size is compared.
+        # The relative noise may differ between the points, so the median is compared.
         typical = np.median(sizes[rows] * deviation / modulus)
         seen = frequency_sweep.scatter(sweep.angular_frequency, modulus)
         sizes[rows] *= seen / typical if seen < SMOOTH * typical else 1.0

@@ -1,9 +1,9 @@
-"""This module checks whether tests that contradict each other agree after all moduli of one test are multiplied by one
-factor.
+"""The factor between the moduli of tests that contradict each other. This module checks whether all tests agree after
+all moduli of one test are multiplied by one factor.
 
 Another temperature, a wrong size of the sample or a wrong calibration changes all moduli of a test by the same factor.
-A common fit lies between such tests and fits none of them well. In this module, the factor is one more parameter of the
-fit.
+A common fit lies between such tests and fits none of them well. In this module, the factor is an additional parameter
+of the fit.
 """
 
 from collections.abc import Callable
@@ -26,10 +26,10 @@ def told(fit: Together, relative: float | np.ndarray = 0.0) -> list[str]:
     agree already, or if no factor makes them agree.
 
     The ratios and relaxation times of a common fit can compensate a factor of a few percent. The common fit then fits
-    each test nearly as well as a separate fit does. A small factor may come from wrong sizes of the samples.
+    each test nearly as well as a separate fit does. Errors in the sizes of the samples may cause a small factor.
 
-    `relative`: relative errors (K,) of the moduli of the K tests due to the sizes of their samples, or one number for
-    all tests.
+    `relative`: relative errors (K,) of the moduli of the K tests, caused by errors in the sizes of the samples. One
+    number means the same error for all tests.
     """
     if fit.kind.effective is not None:
         return []
@@ -56,8 +56,9 @@ def told(fit: Together, relative: float | np.ndarray = 0.0) -> list[str]:
 
 
 def factor_of(fit: Together, k: int) -> tuple[float, float, float] | None:
-    """Return the factor [1] of all moduli of test k, its standard error, and the largest remaining relative misfit. The
-    relative misfit of a test is its misfit, divided by the misfit of a fit to this test alone.
+    """Return the factor [1] of all moduli of test k, the standard error of this factor, and the largest relative misfit
+    that remains in a fit with this factor. The relative misfit of a test is its misfit, divided by the misfit of a fit
+    to this test alone.
 
     Returns None if the factor is 1 within its error, or if the misfit of a test is still large.
     """
@@ -77,7 +78,7 @@ def factor_of(fit: Together, k: int) -> tuple[float, float, float] | None:
     counts, common = [len(y) for _, y, _ in data], np.append(np.asarray(fit.solution.u), 0.0)[None]
     if fit.kind.values is not None:  # the starting points below are for Prony modes
         return _certain(from_starts(evaluate, common), counts)
-    # If tests contradict each other, their common fit may have too few modes. So more modes are tried too.
+    # The common fit of tests that contradict each other may have too few modes. So fits with more modes are tried too.
     more, answer = contributions.MORE if doubts.disagreements(fit.shares) else 0, None
     for modes in range(fit.modes, fit.modes + 1 + more):
         starts = _starts_at_the_others(fit, k, modes)
@@ -113,7 +114,8 @@ def _starts_at_the_others(fit: Together, k: int, modes: int) -> np.ndarray:
     with np.errstate(all="ignore"):
         apart = np.abs(np.log(np.abs(measured / (residuals * scales + measured))))
     size = np.nan_to_num(np.median(apart, axis=-1), nan=0.0, posinf=0.0)
-    # A compliance falls if moduli grow, so the sign of the logarithm is unknown and both signs are tried.
+    # If moduli grow, a compliance falls. So the sign of the logarithm of the factor is unknown, and both signs are
+    # tried.
     return np.concatenate([np.column_stack([found, sign * size]) for sign in (1, -1)])
 
 

@@ -26,16 +26,16 @@ from fitting.methods.uncertainty import equilibrium_change, equilibrium_error
 from fitting.readers.rheometer import Sweep, some
 
 HALF_DECADE = float(np.sqrt(10))
-#: KRAMERS_KRONIG: words that identify the warnings from the Kramers-Kronig check of the data. PARTS: names of the two
-#: repeated fits in the report.
+#: KRAMERS_KRONIG: words in each warning from the Kramers-Kronig check of the data. PARTS: names of the two repeated
+#: fits in the report.
 KRAMERS_KRONIG = "Kramers-Kronig"
 PARTS = ("without_first_half_decade", "without_last_half_decade")
 
 
 def honest(fit: Fit, sweep: Sweep, dense: Spectrum) -> Fit:
-    """Return the fit with the results of further checks: standard errors for correlated noise, the check of the data by
-    the Kramers-Kronig relations, the check of the residuals for structure, the influence of the ends of the band, and
-    the interval of the equilibrium modulus."""
+    """Add the results of further checks to the fit. These are: standard errors for correlated noise, the check of the
+    data with the Kramers-Kronig relations, the check of the residuals for structure, the influence of the ends of the
+    band, and the interval of the equilibrium modulus."""
     wider = with_alike_points(fit, sweep)
     if wider is not fit:
         own = {name: error for name, (_, error) in values(fit).items()}
@@ -54,7 +54,7 @@ def honest(fit: Fit, sweep: Sweep, dense: Spectrum) -> Fit:
         runs, structured = kramers_kronig.structure(sweep.angular_frequency, *_left_over(fit, sweep, sizes))
         details["residuals"] = runs
         told += structured
-        if structured and INDEPENDENT in details:  # do not report the same fact twice
+        if structured and INDEPENDENT in details:  # report the correlated noise only once
             warnings = [w for w in warnings if not w.startswith(SHARED)]
             told = [w.replace(kramers_kronig.NOT_CONTAINED, CONTAINED) for w in told]
     if found.far and any(w.startswith(MISSES) for w in warnings):
@@ -90,8 +90,8 @@ def _with_long_times(fit: Fit, sweep: Sweep) -> Fit:
 
 
 def _left_over(fit: Fit, sweep: Sweep, sizes: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the residuals (n,) [Pa] of G' and of G'' at n frequencies. If the residuals show noise of different size
-    (`viscoelastic.sizes_of_noise`), the residuals of a fit with weights for this noise are returned
+    """Return the residuals (n,) [Pa] of G' and of G'' at n frequencies. If some values have more relative noise than
+    others (`viscoelastic.sizes_of_noise`), return the residuals of a fit with weights for this noise
     (`weighted_by_sizes`)."""
     if sizes is None:
         return fit.storage - sweep.storage, fit.loss - sweep.loss
@@ -102,8 +102,8 @@ def _left_over(fit: Fit, sweep: Sweep, sizes: np.ndarray | None) -> tuple[np.nda
 
 
 def _nearest(fit: Fit, sweep: Sweep, misfit: float) -> str:
-    """Return a warning for a fit to data that no model fits well. Even the best spectrum of any shape misses these
-    data, so the data cause a part of the misfit."""
+    """Return a warning for a fit to data that no model fits well. Even the best spectrum of any shape does not fit
+    these data, so errors of the data cause a part of the misfit."""
     errors, closer = fit.relative_errors(sweep), fit.kind.effective is None
     return (
         f"{MISSES} by {100 * errors.mean():.2g} % on average and by {100 * errors.max():.3g} % at most. The best "
@@ -122,8 +122,8 @@ def sensitivity(fit: Fit, sweep: Sweep) -> dict[str, dict[str, float] | None]:
 
 
 def _points_left(sweep: Sweep) -> dict[str, np.ndarray]:
-    """Return whether each of the n points (n,) is kept, for the fits without the first and without the last half
-    decade."""
+    """Return two masks (n,) of the n points: the points of the fit without the first half decade, and the points of the
+    fit without the last half decade."""
     omega = sweep.angular_frequency
     kept = (omega > omega[0] * HALF_DECADE * (1 + 1e-9), omega < omega[-1] / HALF_DECADE * (1 - 1e-9))
     return dict(zip(PARTS, kept, strict=True))
@@ -131,9 +131,9 @@ def _points_left(sweep: Sweep) -> dict[str, np.ndarray]:
 
 def values(fit: Fit | TimeFit) -> dict[str, tuple[float, float]]:
     """Return the value and the standard error of each parameter that is compared. The keys are the names of the
-    parameters in the report. The standard errors do not contain the error of the gap (--gap-error), because a wrong
-    gap multiplies the moduli at all frequencies by one factor. So this error explains no change of a parameter if one
-    end of the band is left out."""
+    parameters in the report. The standard errors do not contain the error of the gap (--gap-error). A wrong gap
+    multiplies the moduli at all frequencies by one factor. So it cannot change a parameter if one end of the band is
+    left out."""
     gap, every = fit.details.get("gap_error", 0.0), _with_all_errors(fit)
     if not gap:
         return every
@@ -166,13 +166,13 @@ def moved(fit: Fit) -> set[str]:
 
 def decided_by(fit: Fit | TimeFit, part: str) -> dict[str, float]:
     """Return the parameters that depend strongly on the half decade of `part` (one of `PARTS`). If this half decade is
-    left out, they change by more than their standard error and by more than expected from noise. The keys are the names
-    of the parameters. Each value is the size of the change, divided by the larger of these two limits.
+    left out, these parameters change by more than two limits: their standard error, and the change that noise can
+    cause. The keys are the names of the parameters. Each value is the absolute change, divided by the larger limit.
     """
     changes, known = (fit.details.get("band_sensitivity") or {}).get(part) or {}, values(fit)
     by_noise = (fit.details.get("band_scatter") or {}).get(part) or {}
-    # The smooth residuals of an inadequate model are not noise and do not explain a change. So the errors for
-    # independent noise are the limit.
+    # The smooth residuals of an inadequate model are not noise and do not explain a change. So the limit is the error
+    # for independent noise.
     known |= {name: (known[name][0], e) for name, e in fit.details.get(OF_INDEPENDENT, {}).items() if name in known}
     far, out = chance_of_ends.farthest_by_chance(fit, len(changes)), {}
     for name, change in changes.items():
@@ -188,8 +188,7 @@ def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None
     Returns None if too few points are kept."""
     if len(np.unique(sweep.angular_frequency[kept])) <= max(2, len(fit.solution.u) // 2 + 1):
         return None
-    # Each kept point has its weight from the whole sweep, because the standard deviations were smoothed over the whole
-    # sweep.
+    # Each kept point keeps its weight, because the standard deviations were smoothed over the whole sweep.
     storage_sd, loss_sd = sweep.deviations
     part = some(sweep._replace(storage_sd=storage_sd, loss_sd=loss_sd), kept)
     old = {name: value for name, (value, _) in values(fit).items()}
@@ -203,8 +202,8 @@ def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None
         (model,) = (m for m in springpots.FRACTIONAL if m.name == fit.kind.name)
         starts = springpots.starting_points(part)[:, list(model.free)]
         starts[-1] = np.asarray(fit.solution.u)
-        # The variables u refer to a frequency in the middle of the whole band. So the whole sweep is used, and infinite
-        # scales exclude the points that are left out.
+        # The variables u refer to a frequency in the middle of the whole band. So the whole sweep is used here. Points
+        # that are left out get infinite scales.
         scales = np.where(np.tile(kept, 2), np.concatenate(sweep.deviations), np.inf)
         found = springpots.best_minimum(model, sweep, starts, scales)
         assert fit.kind.values is not None
@@ -224,8 +223,8 @@ def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None
 
 
 def _moved_most(fit: Fit) -> list[str]:
-    """Return a warning if parameters depend on the ends of the band. For each end, the warning names at most three
-    parameters, those with the largest changes."""
+    """Return a warning if parameters depend on the ends of the band. For each end, the warning names the three
+    parameters (or fewer) with the largest changes relative to their limits."""
     known, told = values(fit), []
     for part, end in zip(PARTS, ("first", "last"), strict=True):
         beyond = decided_by(fit, part)
@@ -253,4 +252,4 @@ def _relative_change(change: float, value: float) -> str:
     part = change / value
     if abs(part) >= RUNS_AWAY:
         return "more than tenfold"
-    return f"{100 * part:+.2g} %" if abs(part) < 0.995 else f"{100 * part:+.3g} %"  # three digits avoid 1e+02 %
+    return f"{100 * part:+.2g} %" if abs(part) < 0.995 else f"{100 * part:+.3g} %"  # two digits would print 1e+02 %

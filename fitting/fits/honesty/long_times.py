@@ -1,9 +1,9 @@
 """Interval of the equilibrium modulus. It allows for parts of the material that relax only after the end of the test.
 
-The standard error is a linear estimate at the minimum, for the chosen modes. If the relaxation time of a mode is near
-the end of the test or longer, the data hardly distinguish this mode from the equilibrium modulus. So the equilibrium
+The standard error is a linear estimate at the minimum, for the chosen modes. If a mode has a relaxation time near the
+length of the test or longer, the data hardly distinguish this mode from the equilibrium modulus. So the equilibrium
 modulus is fixed at several values, and all other parameters are fitted again (a profile likelihood). Relaxation times
-may be up to `BEYOND` times the longest time that the test resolves. If one more mode fits the data much more closely,
+may be up to `BEYOND` times the longest time that the test resolves. If an additional mode makes the fit much closer,
 the interval is computed with this mode.
 """
 
@@ -27,9 +27,11 @@ from fitting.methods.least_squares import Solution, from_starts
 from fitting.methods.uncertainty import equilibrium_error
 from liverjax.core.struct import Content
 
-#: Factor by which relaxation times may lie beyond the shortest and the longest time that the test resolves.
+#: Relaxation times may be shorter than the shortest, or longer than the longest time that the test resolves, by at most
+#: this factor.
 BEYOND = 10.0
-#: One more mode is used if it lowers the sum of squares, divided by the variance of the noise, by more than this value.
+#: An additional mode is used if it lowers the sum of squares, divided by the variance of the noise, by more than this
+#: value.
 CLOSER = 10.0
 #: Starting values of the relaxation time of the additional mode, divided by the longest time that the test resolves.
 SLOW = (0.3, 1.0, 3.0)
@@ -40,7 +42,7 @@ BISECTIONS, ITERATIONS = 6, 60
 #: The program warns about an interval if its farther end is far from the fitted equilibrium modulus. The distance must
 #: exceed WIDER times the half width of the 95 % interval from the standard error, and LARGE times this modulus.
 WIDER, LARGE = 2.0, 0.05
-#: Half width of a 95 % interval, divided by the standard error, for many independent residuals.
+#: Half width of a 95 % interval, divided by the standard error, if there are many independent residuals.
 NORMAL = 1.96
 
 
@@ -49,13 +51,14 @@ class Interval(NamedTuple):
 
     low: float  # [Pa]
     high: float
-    longest: float  # [s] the interval is valid for materials whose relaxation times are at most this long
+    longest: float  # [s] the interval is valid only if all relaxation times are at most this long
     modes: int  # number of modes of the model
 
 
 class _Family(NamedTuple):
     """Fits of Prony modes with a fixed equilibrium modulus. The unknowns u (2 N,) of N modes are the logs of the N
-    strengths, and N logits. A logit gives the position of a log relaxation time between two bounds (0 to 1)."""
+    strengths, and N logits. The inverse of a logit (0 to 1) is the position of a log relaxation time between two
+    bounds."""
 
     evaluate: Callable[[float, np.ndarray], Solution]  # (equilibrium modulus [Pa], starting points u) -> best fit
     ends: tuple[float, float]  # logs of the shortest and the longest relaxation time that is allowed
@@ -73,10 +76,10 @@ def equilibrium_interval(
 
     Args:
         tests: the fitted tests, one or more.
-        noises: for each test, the factor by which its scales must be multiplied to become standard deviations.
+        noises: for each test, a factor: scales times this factor are standard deviations.
         model: the chosen Prony modes.
         error: standard error [Pa] of the equilibrium modulus; it may be infinite.
-        independent: number of independent residuals, divided by the number of all residuals.
+        independent: effective number of independent residuals, divided by the number of residuals.
     """
     low, high = measured_tests.resolved_by(tests)
     family = _family(tests, noises, (low / BEYOND, high * BEYOND))
@@ -125,15 +128,15 @@ def _family(tests: Sequence[Measured], noises: Sequence[float], times: tuple[flo
 def _with_one_more(
     family: _Family, model: tuple[float, np.ndarray, np.ndarray], longest: float, found: Solution
 ) -> tuple[float, Solution]:
-    """Return the equilibrium modulus and the fit at the minimum. One more mode with a long relaxation time is used if
-    it lowers the misfit by more than `CLOSER`. `longest`: longest time [s] that the test resolves."""
+    """Return the equilibrium modulus and the fit at the minimum. An additional mode with a long relaxation time is used
+    if it lowers the sum of squares enough (`CLOSER`). `longest`: longest time [s] that the test resolves."""
     rest, strengths, times = model
     noise = max(1.0, 2 * float(found.cost) / max(1, len(found.residuals) - len(found.u) - 1))
     best = (rest, found)
     # In a solid, a part of the equilibrium modulus becomes the strength of the slow mode. A fluid has no equilibrium
     # modulus.
     slow = rest or SLOW_PART * float(np.sum(strengths))
-    for part in (0.8, 0.5, 0.2, 0.0):  # fraction of the equilibrium modulus that is not moved to the slow mode
+    for part in (0.8, 0.5, 0.2, 0.0):  # fraction of the equilibrium modulus that remains
         more = np.append(strengths, (1 - part) * slow)
         starts = np.stack([family.unknowns(more, np.append(times, k * longest)) for k in SLOW])
         trial = family.evaluate(part * rest, starts)
@@ -144,7 +147,7 @@ def _with_one_more(
 
 def _end(family: _Family, modulus: float, found: Solution, limit: float, step: float, whole: float) -> float:
     """Return one end of the interval: the equilibrium modulus at which the sum of squares reaches `limit`. The search
-    begins at the minimum (`modulus`). The sign of its first step `step` [Pa] selects the side of the minimum. The
+    begins at the minimum (`modulus`). The sign of the first step `step` [Pa] selects the lower or the upper end. The
     search also ends at 0, and above 10 times `whole` (G0)."""
     u, inside, outside = np.asarray(found.u), modulus, None
     while outside is None:
@@ -166,7 +169,7 @@ def _end(family: _Family, modulus: float, found: Solution, limit: float, step: f
     return outside
 
 
-#: Key in `details` of a fit: the 95 % interval of the equilibrium modulus.
+#: Key of the 95 % interval of the equilibrium modulus in the `details` of a fit.
 INTERVAL = "equilibrium_modulus_interval_95"
 AFit = TypeVar("AFit", Fit, TimeFit, Together)
 
@@ -174,15 +177,15 @@ AFit = TypeVar("AFit", Fit, TimeFit, Together)
 def with_interval(
     fit: AFit, tests: Sequence[Measured], noises: Sequence[float], factor: float = 1.0, common: float = 0.0
 ) -> AFit:
-    """Return the fit of Prony modes with the interval of its equilibrium modulus. A warning is added if this interval
-    is much wider than the interval from the standard error. Fits of other models are returned unchanged.
+    """Add the interval of the equilibrium modulus to a fit of Prony modes. A warning is added if this interval is much
+    wider than the interval from the standard error. Fits of other models are returned unchanged.
 
     Args:
         fit: the fit of these tests.
         tests, noises: see `equilibrium_interval`.
-        factor: reported equilibrium modulus, divided by the equilibrium modulus that fits the data. It differs from 1
-            for a compressed sample.
-        common: standard error [Pa] of the equilibrium modulus that comes from an error common to all measured values.
+        factor: reported equilibrium modulus, divided by the equilibrium modulus that fits the data. The factor is 1,
+            except for a compressed sample.
+        common: standard error [Pa] of the equilibrium modulus due to an error that is common to all measured values.
     """
     if fit.parameters is not None or not fit.converged:
         return fit
@@ -197,7 +200,7 @@ def with_interval(
         return fit
     low, high = factor * found.low, factor * found.high
     rest = max(0.0, float(fit.model.shear_modulus * (1 - np.sum(fit.model.ratios))))
-    # A common error widens the interval and the standard error alike, so it is left out of their comparison.
+    # A common error widens both the interval and the standard error. So their comparison does not contain this error.
     alone = without_part(error, common)
     half = max(rest - low, high - rest)
     wider = half > max(WIDER * NORMAL * alone, LARGE * rest)
@@ -215,11 +218,11 @@ def with_interval(
 def _told_interval(
     ends: tuple[float, float, float], error: float, found: Interval, whole: float, wider: bool
 ) -> list[str]:
-    """Return a warning if an end of the interval lies much farther from the value than two standard errors (`wider`).
-    `ends`: (low, value, high). For a fluid, a warning is given if `high` is at least `LARGE` times `whole` (G0).
+    """Return a warning if the interval is much wider than the interval from the standard error (`wider`). `ends`: (low,
+    value, high). For a fluid, a warning is given if `high` is at least `LARGE` times `whole` (G0).
 
-    The comparison uses the factor `NORMAL` even for few independent residuals, where Student's t is larger, because
-    readers understand the number after ± as a standard error.
+    The comparison always uses the factor `NORMAL`. For few independent residuals, Student's t would be larger. But
+    readers understand the number after ± as a standard error, and expect two standard errors as the half width.
     """
     low, rest, high = ends
     where = f"if parts of the material have relaxation times of up to {found.longest:.3g} s"

@@ -2,7 +2,7 @@
 
 Models that explain the data about equally well differ in their moduli. Each model gets its Akaike weight, and the
 weighted differences between the models become part of the error. Sources: Buckland, Burnham and Augustin 1997,
-Biometrics 53, 603; for few data Hurvich and Tsai 1989, Biometrika 76, 297.
+Biometrics 53, 603. For few data: Hurvich and Tsai 1989, Biometrika 76, 297.
 """
 
 import numpy as np
@@ -19,11 +19,11 @@ NEGLIGIBLE = 1e-4
 
 
 def fitted_moduli(fit: Fit, omega: np.ndarray, noise_given: bool) -> Estimate:
-    """Return G' then G'' (2n,) [Pa] of a fit in closed form, with errors by the delta method (linear propagation of
-    errors).
+    """Return n values of G' and then n values of G'' (2n,) [Pa] of a fit in closed form. The errors are computed with
+    the delta method (linear propagation of errors).
 
-    The errors come from noise and from the choice of the model. They also contain the errors of the gap and of the
-    instrument if the fit contains these errors.
+    Noise and the choice of the model cause these errors. They also contain the errors of the gap and of the instrument
+    if the fit contains these errors.
 
     Args:
         fit: the fit; its field `rivals` contains the fits of the other models if several models were fitted.
@@ -62,15 +62,15 @@ def _weighed(fit: Fit) -> list[tuple[float, Fit]]:
 
 def _akaike(fit: Fit) -> float:
     """Return Akaike's information criterion with the correction for few data. The size of the noise counts as a
-    parameter, because the criterion estimates it from the residuals. If the data have standard deviations, it is their
-    common factor."""
+    parameter, because the criterion estimates this size from the residuals. If the data have standard deviations, the
+    parameter is a common factor of all standard deviations."""
     m, k = 2 * len(fit.storage), number_of_parameters(fit) + 1
     return float(m * np.log(mean_square(fit)) + 2 * k * m / max(1.0, m - k - 1))
 
 
 def _shared_errors(fit: Fit, omega: np.ndarray) -> np.ndarray:
-    """Return the changes (s, 2n) [Pa] of G' and G'' at n frequencies, with one row for each of s systematic errors
-    (gap, instrument). Such an error is common to all points. Each row is the change if the error is one standard
+    """Return the changes (s, 2n) [Pa] of G' and G'' at n frequencies due to s systematic errors (gap, instrument), one
+    row for each error. A systematic error is common to all points. Each row is the change if the error is one standard
     deviation."""
     shared, n = fit.uncertainty.shared, fit.modes
     if shared is None:

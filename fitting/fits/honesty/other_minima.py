@@ -13,27 +13,27 @@ import numpy as np
 
 from liverjax.laws import Law, homogeneous
 
-#: _STRETCHES: widest range of stretches in which stresses are compared. _RATIO: a warning is given if stresses differ
-#: by more than this factor.
+#: _STRETCHES: smallest and largest stretch at which stresses are compared. _RATIO: a warning is given if stresses
+#: differ by more than this factor.
 _STRETCHES, _RATIO = (0.7, 1.4), 1.1
-#: _SAME: parameter sets within this relative difference count as equal. _MOST: maximum number of compared parameter
-#: sets.
+#: _SAME: two parameter sets are equal if all relative differences are at most this value. _MOST: maximum number of
+#: compared parameter sets.
 _SAME, _MOST = 0.02, 12
 
 
 def of_other_minima(
     names: Sequence[str], law_of: Callable[..., Law], values: np.ndarray, every: np.ndarray, F: np.ndarray
 ) -> list[str]:
-    """Return a warning if another minimum has the same cost as the fit, but gives another stress in tension or
+    """Return a warning if another minimum has the same cost as the fit, but predicts another stress in tension or
     compression.
 
     Args:
         names: names of the parameters of the law (P,).
         law_of: function from parameters (P,) to the law with these parameters.
         values: fitted parameters (P,).
-        every: parameters (S, P) of the S searches that reached the cost of the fit.
+        every: parameters (S, P) from S searches, which all reached the cost of the fit.
         F: deformation gradients (n, 3, 3) at the n points of the tests. Stresses are compared at the largest stretch of
-            the tests (at least 1.01, at most 1.4), and at its inverse (at least 0.7).
+            the tests (limited to 1.01 to 1.4), and at the inverse of this stretch (at least 0.7).
     """
     far = float(np.clip(np.max(np.linalg.norm(F, 2, axis=(1, 2))), 1.01, _STRETCHES[1]))
     stretches = np.array([max(1 / far, _STRETCHES[0]), far])

@@ -1,9 +1,9 @@
 """Effect of a load that changes between two rows of the file of a relaxation or creep test. No row shows how the load
 changed, so a linear change is assumed.
 
-If the load was a step at the later row, the material had relaxed less until this row, and the true G0 is smaller. If
-the sample is already loaded in the first row, the load may have been a step at 0 s. The assumption matters if
-relaxation times are as short as the time between the two rows.
+If the load was in fact a step at the later row, the material had less time to relax before this row, and the true G0 is
+smaller. If the sample is already loaded in the first row, the load may have been a step at 0 s. The assumption matters
+if relaxation times are as short as the time between the two rows.
 """
 
 import numpy as np
@@ -13,21 +13,22 @@ from fitting.fits.families import limits
 from fitting.fits.time_tests import TimeFit
 from fitting.readers.time_tests import BEFORE_ROWS, TimeTest, rows_before_jumps
 
-#: Key in `TimeFit.details`: changes, by name, of G0, ratios, times and equilibrium modulus if the load was a step.
+#: Key in `TimeFit.details` of the changes of G0, ratios, times and equilibrium modulus (by name) if the load was a
+#: step.
 OF_A_STEP = "change_if_the_load_was_a_step"
 #: The changes are reported if the change of G0 exceeds this many standard errors.
 SHOWN = 2.0
 
 
 def with_rise_of_load(fit: TimeFit, test: TimeTest, prony: TimeFit) -> TimeFit:
-    """Return the fit. The test is fitted again with steps of the load instead of linear changes between rows. A warning
-    is added if this changes G0 by more than `SHOWN` standard errors. If `fit` is a fit of Prony modes, the changes of
-    all parameters are then added to its details.
+    """Fit the test again with steps of the load instead of linear changes between rows. Return `fit`, with a warning if
+    the steps change G0 by more than `SHOWN` standard errors. If `fit` is a fit of Prony modes, its details then also
+    contain the changes of all parameters.
 
     Args:
         fit: a fit of any model to this test.
         test: data.
-        prony: the fit of Prony modes, which gives the change of G0 for other models.
+        prony: the fit of Prony modes. If `fit` has another model, the change of G0 is computed with `prony`.
     """
     own = prony if fit.parameters is not None else fit
     if not len(test.jumps) or not own.converged:
@@ -55,7 +56,7 @@ def with_rise_of_load(fit: TimeFit, test: TimeTest, prony: TimeFit) -> TimeFit:
 def with_steps(test: TimeTest) -> TimeTest:
     """Return the test with each jump of the load (`TimeTest.jumps`) replaced by a step at the later row.
 
-    If the rows begin under load, the first step is at 0 s.
+    If the sample is already loaded in the first row, the first step is at 0 s.
     """
     driven, jumps = test.driven.copy(), test.jumps
     if test.rise == BEFORE_ROWS:
@@ -67,7 +68,8 @@ def with_steps(test: TimeTest) -> TimeTest:
         driven[last + 1 : row] = driven[last]
     time, driven, answer = rows_before_jumps(jumps, 0.0, test.time, driven, test.answer)
     steps = test._replace(time=time, driven=driven, answer=answer, used=np.isin(time, test.time[test.used]))
-    # The load may now begin later. Then the values measured between the two beginnings belong to the state at rest.
+    # With steps, the load may begin later than with linear changes. The values measured between these two times then
+    # belong to the unloaded state, and are not used.
     return steps._replace(used=steps.used & ((time <= test.begun) | (time > steps.begun)))
 
 

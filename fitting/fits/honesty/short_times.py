@@ -2,9 +2,9 @@
 is estimated from the decrease of the stress at the beginning of the record.
 
 Let r be the decrease of the stress in one half decade, divided by the decrease in the next half decade. If r < 1 is
-constant, the decreases before the record are r, r^2, … times the decrease in the first half decade of the record. A
-material with a single relaxation time, far longer than the first time of the record, gives r = 0.32, and nothing is
-missing in G0. If the stress is a negative power of time, r >= 1 and G0 has no upper bound.
+constant, the decreases before the record are r, r^2, … times the decrease in the first half decade of the record. If a
+material has a single relaxation time, far longer than the first time of the record, then r is 0.32, and no part of G0
+is missing. If the stress is a negative power of time, r >= 1 and G0 has no upper bound.
 """
 
 import numpy as np
@@ -14,9 +14,10 @@ from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.time_tests import TimeTest
 
 HALF_DECADE = float(np.sqrt(10))
-#: Key in `TimeFit.details`: part of G0 [Pa] that the record does not show.
+#: Key in `TimeFit.details` of the part of G0 [Pa] that relaxed before the record.
 MISSING = "relaxed_before_the_record"
-#: If the ratio r of two decreases (module docstring) is above this value, the decrease before the record has no bound.
+#: If the ratio r of two decreases (module docstring) is above this value, the decrease before the record has no upper
+#: bound.
 LEAST_SLOWING = 0.9
 #: The program warns about the decrease, or about the missing part of G0, only if it exceeds this many standard errors
 #: of G0.
@@ -25,11 +26,10 @@ SHOWN = 2.0
 
 def with_short_times(fit: TimeFit, test: TimeTest) -> TimeFit:
     """Return the fit of Prony modes. If the part that may be missing in G0 exceeds `SHOWN` standard errors of G0, this
-    part and a warning are added. If this part has no upper bound, only a warning is added.
-
-    The fit is also returned unchanged if the model is not a Prony series, if the fit did not converge, if the record
-    covers less than one decade of time, if it contains a value at the instant of loading, or if the decrease in its
-    first half decade is below `SHOWN` standard errors.
+    part and a warning are added. If this part has no upper bound, only a warning is added. The fit is returned
+    unchanged if the model is not a Prony series, if the fit did not converge, if the record covers less than one decade
+    of time, if it contains a value at the instant of loading, or if the decrease in the first half decade of the record
+    is at most `SHOWN` standard errors of G0.
     """
     first, last = test.resolved
     if fit.parameters is not None or not fit.converged or test.answers_at_once or last < HALF_DECADE**2 * first:

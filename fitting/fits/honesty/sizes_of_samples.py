@@ -1,4 +1,4 @@
-"""Errors of the parameters of several tests due to errors in the sizes of the samples.
+"""Errors of the parameters of a common fit of several tests, due to errors in the sizes of the samples.
 
 A wrong gap or radius multiplies all moduli of a test by a factor (see `total_error.of_geometry`). If only one test is
 fitted, this factor changes only G0. If tests with different factors are fitted together, ratios and relaxation times
@@ -28,8 +28,8 @@ def shares_with_sizes(fit: Together, relative: float | np.ndarray) -> dict[str, 
     names = [n for n in own.names if not n.startswith("strengths[")]
     kept = [own.names.index(n) for n in names]
     by_size = _by_sizes(fit)[kept] * relative
-    # Different samples have independent factors. One sample that is mounted once has one factor for all its tests. The
-    # larger of the two errors is used.
+    # If the samples are different, their factors are independent. If one sample is mounted only once, all its tests
+    # have the same factor. The larger of these two errors is used.
     both = np.maximum(np.linalg.norm(by_size, axis=1), np.abs(by_size.sum(axis=1)))
     shares = {"noise": own.standard_errors[kept], "geometry": both}
     found = {source: dict(zip(names, part.tolist(), strict=True)) for source, part in shares.items()}

@@ -1,7 +1,6 @@
-"""The total error of every parameter. It has one share from noise, and one share from each of several other sources.
-
-The shares are independent of each other, so the total is the root of the sum of their squares. The scatter between
-samples is not included: the parameters describe the measured curve, not the material.
+"""The total error of every parameter. Noise causes one share of this error, and each of several other sources causes
+another share. The shares are independent of each other, so the total error is the root of the sum of their squares. The
+scatter between samples is not included: the parameters describe the measured curve, not the material.
 """
 
 import numpy as np
@@ -15,7 +14,7 @@ from fitting.fits.time_tests import TimeFit
 from fitting.fits.viscoelastic import Fit
 from fitting.methods.uncertainty import equilibrium_change
 
-#: Usual standard deviations [m]: GAP for the gap that the instrument displays, RADIUS for the radius of the plates.
+#: Usual standard deviations [m]: GAP of the gap that the instrument displays, RADIUS of the radius of the plates.
 GAP, RADIUS = 50e-6, 10e-6
 
 
@@ -28,27 +27,30 @@ def of_geometry(simulation: Simulation, gap_error: float | None, axial: bool = F
     Args:
         simulation: the radius and the gap.
         gap_error: standard deviation [m] of the gap; None: `GAP`.
-        axial: whether force and displacement were measured, or moduli of tension, instead of torque and twist.
+        axial: True if force and displacement or moduli of tension were measured; False if torque and twist were
+            measured.
     """
     gap, power = GAP if gap_error is None else gap_error, 2 if axial else 4
     return float(np.hypot(gap / simulation.height, power * RADIUS / simulation.radius))
 
 
 def of_described_sizes(per_size: tuple[float, float]) -> float:
-    """Return the same error for a test that a TOML file describes. `per_size`: see `TimeTest`."""
+    """Return the error of `of_geometry` for a test that a TOML file describes. `per_size`: see `TimeTest`."""
     return float(np.hypot(GAP * per_size[0], RADIUS * per_size[1]))
 
 
 def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
-    """Return the errors of the parameters: for each source of error, a dictionary with the parameter names of
-    `edges.values` as keys. The error of the gap is a part of the share `geometry`.
+    """Return the errors of the parameters: for each source of error, a dictionary whose keys are the parameter names of
+    `edges.values`. The error of the gap is a part of the share `geometry`.
 
     The share `band` is the larger change of a parameter if one end of the band is left out. This change counts only if
-    it is larger than expected from noise (`edges.decided_by`). The square of the change due to noise is subtracted from
-    the square of this change. If the change is very large (`edges.RUNS_AWAY`), the share is the size of the parameter.
-    The share `long_times` comes from the farther end of `long_times.equilibrium_interval`, converted to a standard
-    deviation, without the standard error. The share `short_times` is the part of G0 that `short_times` finds to be
-    missing. The share `rise_of_load` is the change if the load was a step at the first row that shows the new load.
+    it is larger than expected from noise (`edges.decided_by`). The square of the standard error, or of the change due
+    to noise if it is larger, is subtracted from the square of this change. If the result is very large
+    (`edges.RUNS_AWAY`), the share is the absolute value of the parameter or its standard error, whichever is larger.
+    For the share `long_times`, the farther end of `long_times.equilibrium_interval` is converted to a standard
+    deviation, and the standard error is subtracted (as squares). The share `short_times` is the part of G0 that relaxed
+    before the record (module `short_times`). The share `rise_of_load` is the change if the load was a step at the first
+    row that shows the new load.
     """
     known = edges.values(fit)
     noise = {name: error for name, (_, error) in known.items()}
@@ -64,8 +66,8 @@ def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
         for name in edges.decided_by(fit, part):
             change, scatter = (fit.details[key][part][name] for key in ("band_sensitivity", "band_scatter"))
             beyond = np.sqrt(max(0.0, change**2 - max(noise[name], scatter) ** 2))
-            # If the other points do not determine a parameter, its change may have any size, so the size of the
-            # parameter is used as the error.
+            # If the other points do not determine a parameter, its change may have any size. So the absolute value of
+            # the parameter is used as the error.
             own = max(abs(known[name][0]), noise[name])
             out["band"][name] = max(out["band"][name], float(own if beyond > edges.RUNS_AWAY * own else beyond))
     shown = fit.parameters or fit.uncertainty
@@ -93,9 +95,9 @@ def root_of_squares(shares: dict[str, dict[str, float]]) -> dict[str, float]:
 
 
 def _of_bias(fit: Fit | TimeFit, moved: np.ndarray) -> dict[str, float]:
-    """Return the absolute change of each parameter, by name. `moved` (P,): changes of the parameters of the model, or
-    of G0, ratios and relaxation times of Prony modes. The change of the equilibrium modulus of Prony modes is computed
-    from these changes."""
+    """Return the absolute change of each parameter, by name. `moved` (P,): changes of the parameters of the model. For
+    Prony modes, these are the changes of G0, ratios and relaxation times. The change of the equilibrium modulus of
+    Prony modes is computed from these changes."""
     names = (fit.parameters or fit.uncertainty).names
     out = {name: abs(float(d)) for name, d in zip(names, moved, strict=True)}
     if fit.parameters is None:

@@ -1,5 +1,5 @@
 """Errors in the columns of a stress-stretch curve. If the residuals keep their sign over many points, this module tests
-whether the columns contain other quantities than stretch and nominal stress."""
+whether the columns contain quantities other than stretch and nominal stress."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -18,28 +18,30 @@ from liverjax.laws import Law, homogeneous
 #: roundoff.
 _FEWEST, _EXACT = 8, 1e-6
 #: A cause is reported if it lowers Akaike's criterion by more than _BETTER and if the remaining residuals look random
-#: (probability of their order above _RANDOM).
+#: (p-value of the runs test above _RANDOM).
 _BETTER, _RANDOM = 10.0, 0.05
-#: Causes are named together if their values of Akaike's criterion differ by less than this (Burnham, Anderson 2002).
+#: The best cause is named, and each cause whose value of Akaike's criterion is higher by less than this value (Burnham,
+#: Anderson 2002).
 _AS_GOOD = 6.0
 _stress = jax.jit(homogeneous.nominal_stress)
 
 
 class _Cause(NamedTuple):
-    """Another meaning of the columns of a curve. The driven quantity is the quantity that the test imposes,
-    for example the stretch. The function `driven` computes the true driven quantity from (driven column, number). The
-    function `column` computes the values in the stress column from (nominal stress, true driven quantity, number).
+    """A possible error in the columns of a curve: the columns contain quantities other than their names say. The driven
+    quantity is the quantity that the test imposes, for example the stretch. The function `driven` computes the true
+    driven quantity from (driven column, number). The function `column` computes the values in the stress column from
+    (nominal stress, true driven quantity, number).
 
-    `number` is the fitted offset, the same for all curves. The optimiser uses it in dimensionless form: divided by the
-    stress scale of the first curve with a structured misfit if the offset is a stress, otherwise by the range of
-    the driven column of this curve.
+    `number` is the fitted offset, the same for all curves. The optimiser uses a dimensionless offset, in a unit from
+    the first curve with a structured misfit. The unit is the stress scale of this curve if the offset is a stress,
+    otherwise the range of the driven column.
     """
 
     words: str
     driven: Callable[[np.ndarray, float], np.ndarray]
     column: Callable[[np.ndarray, np.ndarray, float], np.ndarray]
-    free: bool = False  # whether a number is fitted
-    of_stress: bool = False  # whether this number is a stress
+    free: bool = False  # whether an offset is fitted
+    of_stress: bool = False  # whether this offset is a stress
 
 
 _CAUSES = (
@@ -51,16 +53,16 @@ _CAUSES = (
 
 
 def structured_curves(curves: list[Curve], fit: LawFit, every: bool = False) -> list[str]:
-    """Return a warning about the curves whose residuals keep their sign over many points. If another meaning of the
-    columns explains these residuals, the warning states this cause.
+    """Return a warning about the curves whose residuals keep their sign over many points. If an error in the columns
+    explains these residuals, the warning states this cause.
 
     Args:
         curves: the curves.
         fit: the best fit of the curves.
-        every: whether all laws were tried, so that the warning does not advise to try other laws.
+        every: whether all laws were tried. If True, the warning does not advise to try other laws.
     """
-    # If a warning of the fit already reports a factor for each test, the stress of the law is multiplied by this
-    # factor.
+    # If a warning of the fit already reports factors between the law and the curves, the stress of the law is
+    # multiplied by its factor for each curve.
     named = any(sentence.startswith(OWN_FACTORS) for sentence in fit.warnings)
     misfit = [(c, (_model(fit.law, c) * _nearest_factor(fit.law, c, named) - c.stress) / c.scale) for c in curves]
     runs = {c.label: runs_probability(r) for c, r in misfit}
@@ -92,8 +94,8 @@ def _nearest_factor(law: Law, curve: Curve, named: bool) -> float:
 
 
 def _named_cause(curves: list[Curve], odd: list[Curve], fit: LawFit) -> str:
-    """Return a string with the causes that lower Akaike's criterion most and leave random residuals. The string is
-    empty if there is no such cause."""
+    """Return a text with the causes that lower Akaike's criterion most, and whose remaining residuals are random. The
+    text is empty if there is no such cause."""
     found: list[tuple[_Refit, str]] = []
     limit = _criterion(fit.law, curves, odd, None).value - _BETTER
     for cause in _CAUSES:
@@ -114,13 +116,13 @@ def _named_cause(curves: list[Curve], odd: list[Curve], fit: LawFit) -> str:
 class _Refit(NamedTuple):
     value: float  # Akaike's criterion, corrected for few points
     chance: float  # smallest p-value of the runs test of residuals, for all curves with a structured misfit
-    number: float  # fitted number of the cause, in the unit of its column; 0 if no number is fitted
+    number: float  # fitted offset of the cause, in the unit of its column; 0 if no offset is fitted
     law: Law
 
 
 def _criterion(law: Law, curves: list[Curve], odd: list[Curve], cause: _Cause | None) -> _Refit:
     """Fit the law again, starting from its fitted parameters, and return Akaike's criterion and other results. `cause`
-    is another meaning of the columns of the curves `odd`. If it is None, the columns contain what their names say."""
+    is an error in the columns of the curves `odd`. If `cause` is None, the columns contain what their names say."""
     leaves, tree = jax.tree.flatten(law)
     every = np.array([float(leaf) for leaf in leaves])
     start = every[every != 0]

@@ -2,7 +2,7 @@
 
 The tests are frequency sweeps, relaxation tests, creep tests, and phase velocities of shear waves.
 
-The noise of every test is different. Its size is estimated during the fit, from the residuals of the test.
+Each test has its own noise level. It is estimated during the fit, from the residuals of the test.
 """
 
 import time
@@ -45,8 +45,8 @@ from fitting.methods.least_squares import from_starts
 from fitting.readers.frequency_sweep import Sweep, check_sweep
 from liverjax.core.errors import InputError
 
-#: ROUNDS: maximum number of rounds, each with a fit and then new weights of the tests. SETTLED: the rounds end if the
-#: noise of no test changes by more than this fraction.
+#: ROUNDS: maximum number of rounds. Each round is a fit, followed by new weights of the tests. SETTLED: the rounds end
+#: if the noise of no test changes by more than this fraction.
 ROUNDS, SETTLED = 12, 0.01
 
 
@@ -89,8 +89,8 @@ def fit(
 def _raised_together(
     tests: list[Measured], band: ResolvedBand, numbers: range, kind: Kind, progress: Callable
 ) -> list[Together]:
-    """Return fits with more and more modes. The search ends after two fits in a row that do not lower the criterion, do
-    not converge, or have superfluous modes."""
+    """Return fits with increasing numbers of modes. The search ends after two fits in a row that do not lower the
+    criterion, do not converge, or have superfluous modes."""
     tried: list[Together] = []
     best, failures = np.inf, 0
     for n in numbers:
@@ -108,7 +108,8 @@ def _able(fit: Together, band: ResolvedBand) -> bool:
 
 
 def _one_test(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind) -> Together:
-    """Fit a given number of modes to all tests. After each fit, the tests get new weights from their residuals."""
+    """Fit a given number of modes to all tests, in several rounds. After each round, the tests get new weights from
+    their residuals."""
     parts = [reported_numbers(t) for t in tests]
     begin, evaluate = time.perf_counter(), partial(tests_evaluated, list(map(name_of, tests)), kind)
     starts, noise = starts_of_all(tests, band, modes, kind), np.array([first_noise(t) for t in tests])

@@ -28,8 +28,8 @@ MORE, CLEARLY = 2, 10.0
 
 
 def shares_of(fit: Together) -> list[Share]:
-    """Return the contribution of each test: the standard errors if this test is left out, and the misfit of a fit to
-    this test alone."""
+    """Return the contribution of each test: the standard errors of the parameters without this test, and the misfit of
+    a fit to this test alone."""
     u = np.asarray(fit.solution.u)
     vector = host.with_jacobian(partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell), u)[1]
     rows = np.asarray(fit.solution.jacobian)
@@ -40,8 +40,8 @@ def _residuals_alone(fit: Together, k: int) -> np.ndarray:
     """Return the residuals of all tests, divided by their scales, from a fit to test k alone. The residuals of the
     other tests are 0.
 
-    This fit has as many modes as the common fit, or more if additional modes fit the test better. If tests contradict
-    each other, their common fit may have too few modes.
+    This fit has as many modes as the common fit, or more if additional modes fit the test better. The common fit of
+    tests that contradict each other may have too few modes.
     """
     parts = [reported_numbers(t) for t in fit.tests]
     # Infinite standard deviations exclude a test.
@@ -57,8 +57,8 @@ def _residuals_alone(fit: Together, k: int) -> np.ndarray:
         return best
     lowest = _criterion_alone(best, count, free)
     for modes in range(fit.modes, fit.modes + MORE + 1):
-        # If the moduli of this test are far from the moduli of the others, the starting points for all tests are not
-        # good for this test.
+        # If the moduli of this test are far from the moduli of the other tests, starting points for all tests are not
+        # near the minimum of this test. So these starting points are computed for this test alone.
         starts = starts_of_all([fit.tests[k]], own, modes, fit.kind)
         r, free = np.asarray(from_starts(evaluate, starts, data).residuals), starts.shape[1]
         criterion = _criterion_alone(r, count, free)
@@ -75,16 +75,16 @@ def _criterion_alone(r: np.ndarray, count: int, free: int) -> float:
 def shares_by_rows(
     fit: Together, jacobian: np.ndarray, slope: np.ndarray, values: np.ndarray, alone: Callable[[int], np.ndarray]
 ) -> list[Share]:
-    """Return the contribution of each test: the standard errors from the residuals of the other tests only, and the
-    misfit of a fit to this test alone.
+    """Return the contribution of each test: the standard errors of the parameters from the residuals of the other tests
+    only, and the misfit of a fit to this test alone.
 
     Args:
         fit: the common fit.
         jacobian: derivatives of the residuals of all tests with respect to u; rows of a prior may follow.
         slope: derivatives of the reported parameters with respect to u.
         values: the reported parameters.
-        alone: function from the index of a test to the residuals, divided by their scales, of a fit to this test alone.
-            The rows are in the order of the common fit.
+        alone: function of the index of a test. It returns the residuals of a fit to this test alone, divided by their
+            scales, for all tests in the order of the common fit.
     """
     counts = [s.points for s in fit.shares]
     free = jacobian.shape[1] if fit.kind.effective is None else fit.kind.effective

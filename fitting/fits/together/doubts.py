@@ -27,7 +27,7 @@ _SHORT = 0.2
 
 
 def disagreements(shares: list[Share], remedy: str = "try more modes") -> list[str]:
-    """Return a warning for each test that the common fit misses by much more than a fit to this test alone does."""
+    """Return a warning for each test whose misfit is much larger in the common fit than in a fit to this test alone."""
     return [
         f"the tests do not agree. The misfit of {s.source or s.name} is {100 * s.misfit:.2g} % in the common fit, but "
         f"only {100 * s.misfit_alone:.2g} % in a fit to this test alone: check whether this test was made at another "
@@ -48,8 +48,8 @@ def missed(shares: list[Share]) -> list[str]:
 
 
 def of_better_fits(chosen: Together, undetermined: list[Together]) -> list[str]:
-    """Return a warning if a fit with more modes follows the tests clearly better, although the tests do not determine
-    all of its parameters. `undetermined`: all fits with such parameters."""
+    """Return a warning if a fit with more modes follows the tests clearly better, but has parameters that the tests do
+    not determine. `undetermined`: all fits with such parameters."""
     best = min(undetermined, key=criterion_of_all, default=chosen)
     lower = criterion_of_all(chosen) - criterion_of_all(best)
     if best.modes <= chosen.modes or not lower > BETTER:
@@ -63,8 +63,9 @@ def of_better_fits(chosen: Together, undetermined: list[Together]) -> list[str]:
 
 
 def of_rises(chosen: Together) -> list[str]:
-    """Return a warning for each relaxation or creep test whose load changes between two rows of the file, if modes
-    relax during this time. Only the first such change of a test is considered."""
+    """Return a warning for each relaxation or creep test whose load changes between two rows of the file, if the
+    shortest relaxation time is not much longer than this change (`_SHORT`). Only the first such change of a test is
+    considered."""
     own = chosen.model.relaxation_times[np.asarray(chosen.model.ratios) > 0.01]
     out = []
     for test in (t for t in chosen.tests if isinstance(t, TimeTest)):
@@ -80,8 +81,8 @@ def of_rises(chosen: Together) -> list[str]:
 
 
 def _fitted_by_noise(fit: Together) -> list[np.ndarray]:
-    """Return the predictions of each test. If the two series of a test have noise of different size, the predictions
-    are those of a fit with weights for this noise (`weighted_by_sizes`)."""
+    """Return the predicted values of each test. If the two series of a test have different noise, the values are
+    predicted by a fit with weights for this noise (`weighted_by_sizes`)."""
     J, r = np.asarray(fit.solution.jacobian), np.asarray(fit.solution.residuals)
     ends, groups = np.cumsum([s.points for s in fit.shares]), []
     for test, end, share in zip(fit.tests, ends, fit.shares, strict=True):

@@ -37,8 +37,8 @@ def name_of(test: Measured) -> str:
 
 
 def series_of(test: Measured) -> tuple[str, ...]:
-    """Return the names of the series of measured values of a test, in parentheses. The series have equal lengths. The
-    name is empty if there is only one series."""
+    """Return the names of the series in the measured values of a test, for example " (G')". All series have the same
+    length. If there is only one series, its name is empty."""
     if isinstance(test, Sweep):
         return (" (G')", " (G'')")
     waves = isinstance(test, Dispersion) and test.attenuation is not None
@@ -46,7 +46,7 @@ def series_of(test: Measured) -> tuple[str, ...]:
 
 
 def reported_numbers(test: Measured) -> tuple[tuple, np.ndarray, np.ndarray]:
-    """Return the arrays from which a test is predicted, the measured values of the test, and the scales of these
+    """Return three results: the arrays from which a test is predicted, the measured values, and the scales of these
     values."""
     if isinstance(test, Sweep):
         return (test.angular_frequency,), np.concatenate([test.storage, test.loss]), np.concatenate(test.deviations)
@@ -58,8 +58,9 @@ def reported_numbers(test: Measured) -> tuple[tuple, np.ndarray, np.ndarray]:
 
 
 def sizes_of(test: Measured) -> np.ndarray:
-    """Return the divisors for relative errors: the measured values, with a lower bound in relaxation and creep. If
-    errors of the phase angle cause the scatter of G'', its divisor is |G*|."""
+    """Return the divisors for relative errors: the measured values, with a lower bound in relaxation and creep. If the
+    standard deviations of a sweep were estimated from scatter, the divisor of G'' is |G*|, because errors of the phase
+    angle may cause this scatter."""
     _, measured, scales = reported_numbers(test)
     if isinstance(test, Sweep) and test.sd_estimated:
         return np.concatenate([test.storage, np.hypot(test.storage, test.loss)])
@@ -67,8 +68,8 @@ def sizes_of(test: Measured) -> np.ndarray:
 
 
 def sizes_beside(test: Measured, fitted: np.ndarray) -> np.ndarray:
-    """Return the divisors for relative errors (`sizes_of`) of a test, if the fit predicts the values `fitted`. The
-    divisor is infinite for a value that does not count (`time_tests.relative_sizes`)."""
+    """Return the divisors for relative errors of a test (`sizes_of`). The fit predicts the values `fitted`. The divisor
+    is infinite for a value that does not count (`time_tests.relative_sizes`)."""
     sizes = sizes_of(test)
     if not isinstance(test, TimeTest):
         return sizes
@@ -76,14 +77,15 @@ def sizes_beside(test: Measured, fitted: np.ndarray) -> np.ndarray:
 
 
 def relative_errors_of(test: Measured, fitted: np.ndarray) -> np.ndarray:
-    """Return the relative errors (k,) of the k values of a test that count, if the fit predicts the values `fitted`."""
+    """Return the relative errors (k,) of those k values of a test that count (`sizes_beside`). The fit predicts the
+    values `fitted`."""
     sizes = sizes_beside(test, fitted)
     return (np.abs(fitted - reported_numbers(test)[1]) / sizes)[np.isfinite(sizes)]
 
 
 def least_noise(test: Measured) -> float:
     """Return the lower bound of the noise of a test, divided by its scales. The bound is 1 if standard deviations are
-    given, because given standard deviations are not reduced."""
+    given: the fit may enlarge them, but not reduce them."""
     return 1.0 if isinstance(test, Sweep) and test.noise_given else QUIETEST
 
 

@@ -13,7 +13,7 @@ from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.least_squares import Solution, degrees_of_freedom
 from liverjax.core.struct import Content
 
-#: Degrees of freedom needed to estimate a noise.
+#: Degrees of freedom that are needed to estimate the noise of a test.
 LEAST_FREEDOM = 3.0
 
 
@@ -23,7 +23,7 @@ class Share(NamedTuple):
     name: str  # sweep, dispersion, relaxation or creep
     source: str
     points: int  # number of measured values
-    noise: float  # noise in the common fit, divided by the scales; at least 1 if standard deviations are given
+    noise: float  # noise in the common fit / scales; at least 1 if standard deviations are given
     alone: float  # noise in a fit to this test alone, divided by the scales
     misfit: float  # relative misfit of this test in the common fit
     misfit_alone: float  # relative misfit of the fit to this test alone
@@ -41,7 +41,7 @@ class Together(NamedTuple):
     uncertainty: Estimate
     converged: bool
     shares: list[Share]
-    fitted: list[np.ndarray]  # predictions of each test: G' then G'' [Pa], velocities then attenuations, or response
+    fitted: list[np.ndarray]  # predicted: G' and then G'' [Pa], velocities and then attenuations, or response
     tried: list[Content]
     warnings: tuple[str, ...]
     run_time: float
@@ -78,10 +78,10 @@ def misfits(
 
     Args:
         tests: K tests.
-        data: for each test, the arrays from which it is predicted, its measured values, and the divisors of its
-            residuals.
+        data: for each test, three entries: the arrays from which the test is predicted, the measured values, and the
+            divisors of the residuals.
         residuals: residuals of all tests; rows of a prior may follow.
-        noise: noise (K,) of the tests, relative to their scales.
+        noise: noise (K,) of the tests, divided by their scales.
         free: number of parameters that the data determine.
     """
     counts = [len(y) for _, y, _ in data]
@@ -97,8 +97,8 @@ def misfits(
 
 
 def over_own_noise(found: Solution, shares: list[Share], ratio: np.ndarray) -> Solution:
-    """Return the solution with the residuals of each test divided by the noise found for this test. `ratio` (K,): noise
-    that was used in the fit, divided by the noise that was found.
+    """Divide the residuals of each test by the noise that was found for this test, and return the solution. `ratio`
+    (K,): noise that was used in the fit, divided by the noise that was found.
 
     Residuals of a prior are multiplied by the geometric mean of the ratios, because the weight of a prior refers to the
     mean noise.
@@ -117,9 +117,9 @@ def size_of_noise(residuals: np.ndarray, freedom: float) -> float:
 def noises(
     tests: list[Measured], parts: list, residuals: np.ndarray, used: np.ndarray, taken: np.ndarray | float
 ) -> np.ndarray:
-    """Return the noise of each test, relative to its scales: the root of its squared residuals per degree of freedom.
-    With fewer than `LEAST_FREEDOM` degrees, the result is at least `first_noise`. `used`: noise in the fit. `taken`:
-    Jacobian of the residuals, or effective number of parameters."""
+    """Return the noise of each test, divided by its scales: the root of (sum of the squared residuals / degrees of
+    freedom). With fewer than `LEAST_FREEDOM` degrees of freedom, the result is at least `first_noise`. `used`: noise
+    that was used in the fit. `taken`: Jacobian of the residuals, or effective number of parameters."""
     counts = np.array([len(y) for _, y, _ in parts])
     left = np.split(residuals[: counts.sum()], np.cumsum(counts)[:-1])
     freedoms = degrees_of_freedom(np.asarray(taken), counts) if np.ndim(taken) else counts * (1 - taken / counts.sum())

@@ -17,7 +17,7 @@ STARTS = 6
 
 def starts_of_all(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind) -> np.ndarray:
     """Return S starting points (S, P) of the P variables, with relaxation times that are spread over the decades of the
-    tests. The strengths come from non-negative least squares on the moduli of the tests."""
+    tests. The strengths are fitted to the moduli of the tests by non-negative least squares."""
     out = []
     for times in generalised_maxwell.times_over(band.resolved, modes, STARTS):
         A, b = (np.concatenate(rows) for rows in zip(*(_apparent(t, times) for t in tests), strict=True))
@@ -38,11 +38,12 @@ def _apparent(test: Measured, times: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _moduli_of(test: Sweep | Dispersion) -> tuple[np.ndarray, ...]:
-    """Return G' and G'' [Pa]. Velocities alone give only one modulus, about |G*|."""
+    """Return G' and G'' [Pa]. From velocities without attenuations, only one modulus is computed, which is about
+    |G*|."""
     if isinstance(test, Sweep):
         return test.storage, test.loss
     if test.attenuation is None:
         return (test.density * test.velocity**2,)
     found = shear_waves.moduli_of(test.velocity, test.attenuation, test.angular_frequency, test.density)
-    # Noise can make moduli negative, and a fit cannot begin from negative moduli. Small positive moduli replace them.
+    # Noise can make moduli negative, but a fit cannot begin from negative moduli. Small positive moduli replace them.
     return tuple(np.maximum(G, 1e-2 * np.abs(found[0]).max()) for G in found)
