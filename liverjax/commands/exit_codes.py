@@ -32,8 +32,8 @@ def show_unknown_letters() -> None:
 
 
 class _Unbroken:
-    """Standard output or standard error without `BrokenPipeError`: if the reader of a pipe has closed it, the text is
-    lost, and the command continues."""
+    """A wrapper of standard output or standard error that raises no `BrokenPipeError`. If the reader has closed the
+    pipe, the text is lost, and the command continues."""
 
     def __init__(self, stream: TextIO) -> None:
         self.stream = stream
@@ -67,9 +67,9 @@ def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namesp
 
     Args:
         run: function that runs the command with its options and returns 0 or 1.
-        options: the parsed command line. If it has `optional_files`, a note lists the optional files in the folder of
-            results that come from an earlier run. If it has `resume`, then `kept` is a function of `options` that
-            returns the files from which an interrupted run can be continued.
+        options: the parsed command line. The attribute `optional_files`, if present, contains name patterns of files in
+            the folder of results: a note lists the files that come from an earlier run. If the attribute `resume` is
+            present, `kept` is present too: `kept(options)` returns the files that --resume needs to continue a run.
     """
     out, err = (stream if stream is None else _Unbroken(stream) for stream in (sys.stdout, sys.stderr))
     with warnings.catch_warnings(), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
@@ -107,7 +107,7 @@ def end_if_stopped(code: int) -> None:
     """End the process immediately if its exit code is `STOPPED` (Ctrl-C) or `UNUSABLE`.
 
     After Ctrl-C JAX may still compute in another thread. Python would wait for that thread, and the process could end
-    with a crash. After a full disk HDF5 would try to write its file again, and would crash.
+    with a crash. If the disk is full, HDF5 would try to write its file again, and would crash.
     """
     if code in (STOPPED, UNUSABLE):
         for stream in (sys.stdout, sys.stderr):
@@ -127,8 +127,8 @@ def _tell_of_earlier_files(options: argparse.Namespace, begin: float) -> None:
 
 
 def _any_kept(options: argparse.Namespace, begin: float) -> bool:
-    """Return whether --resume can continue the run: files to continue from were written since `begin`, or the run
-    itself continues from files."""
+    """Return whether --resume can continue the run. The files for this were written since `begin`, or the run itself
+    was started with --resume."""
     kept = options.kept(options) if "resume" in options else ()
     return any(options.resume or not _older(file, begin) for file in kept)
 

@@ -18,9 +18,9 @@ def run(arguments: list[str], prog: str) -> int:
 
     Args:
         arguments: the arguments after `fit`.
-        prog: the command as the user typed it, which --help shows.
+        prog: the command as the user typed it; --help shows this name.
     """
-    # The only import of `fitting` in `liverjax`: `fitting` uses `liverjax`, not the other way round.
+    # This is the only import of `fitting` in `liverjax`: otherwise `liverjax` does not depend on `fitting`.
     from fitting.__main__ import main
 
     return main(arguments, prog)

@@ -62,7 +62,8 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _without_page(playing: "Playing", steps: int) -> int:
-    """Pull the surface node farthest from the fixed nodes by a tenth of the body's size. Return 1 if a step failed."""
+    """Pull one surface node by a tenth of the body's size: the node farthest from the centre of the fixed nodes. Return
+    1 if a step failed."""
     import numpy as np
 
     from liverjax.core import status

@@ -1,4 +1,4 @@
-"""``liverjax reduce SCENE.toml ROWS.csv``: make a reduced model of a scene from full runs, one for each row of a
+"""``liverjax reduce SCENE.toml ROWS.csv``: make a reduced model of a scene from one full run for each row of a
 table."""
 
 import argparse
@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> int:
     print(
         f"{model.number_of_modes} modes, {len(model.points)} points, {reduction.learnt(model)}\nwritten: {options.out}"
     )
-    # The path in a scene file is relative to the folder of this file.
+    # Paths in a scene file are relative to the folder of the scene file.
     path = os.path.relpath(options.out.resolve(), options.scene.parent.resolve())
     print(f'to use this model, write reduced = "{Path(path).as_posix()}" in [solve]')
     return 0

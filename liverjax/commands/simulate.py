@@ -72,7 +72,7 @@ def run(options: argparse.Namespace) -> int:
     given = scene.points_are
     if given == "loaded":
         scene = unloaded(scene).scene
-    bar = tqdm(total=scene.solve.steps, unit="step", disable=None, leave=False)  # shown only on a terminal
+    bar = tqdm(total=scene.solve.steps, unit="step", disable=None, leave=False)  # tqdm shows it only on a terminal
     report = None if bar.disable else lambda _: bar.update()
     try:
         ran, scene = _reduced(scene)
@@ -176,7 +176,7 @@ def _with_mesh_error(scene: "Scene", ran: "Ran") -> tuple["Ran", list[str]]:
     try:
         arguments = (scene, richer(scene), result.positions, result.reactions, result.pressure)
         error = compiled(estimated_error, *arguments)(*arguments)
-    except InputError as e:  # the run is finished, so its result is written all the same
+    except InputError as e:  # the result of the run is still written, without its mesh error
         return ran, [str(e)]
     return ran._replace(result=replace(result, mesh_error=error)), []
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from liverjax.core.errors import InputError
 
-#: The names in `liverjax.jobs.sweep.OUTPUTS`. Because of this copy, --help does not have to load that module.
+#: A copy of the names in `liverjax.jobs.sweep.OUTPUTS`, so that --help does not have to load that module.
 OUTPUTS = ("final_positions", "positions", "largest_displacement", "final_reactions", "largest_pressure")
 
 
@@ -73,7 +73,7 @@ def run(options: argparse.Namespace) -> int:
     out = _results(options)
     if out.is_dir():
         raise InputError(f"--out {out} is a folder: name a file for the results, e.g. {out / 'sweep.h5'}")
-    bar = tqdm(total=len(table.rows), unit="row", disable=None, leave=False)  # shown only on a terminal
+    bar = tqdm(total=len(table.rows), unit="row", disable=None, leave=False)  # tqdm shows it only on a terminal
     try:
         done = sweep.run(table, out, options.resume, process, bar.update)
     except OSError as error:
@@ -127,7 +127,7 @@ def _is_address(text: str) -> bool:
 def _share(given: list[str]) -> tuple[int, int]:
     """Return the index of this process and the number of processes, from JAX's distributed runtime.
 
-    `given`: HOST:PORT N I, or empty on a cluster.
+    `given`: the values of --distributed: HOST:PORT, number of processes, index of this process; none on a cluster.
     """
     import jax
 
@@ -149,7 +149,7 @@ def _share(given: list[str]) -> tuple[int, int]:
         else:
             jax.distributed.initialize()
         process = (jax.process_index(), jax.process_count())
-        # Runs need no communication. The runtime is shut down here, so that a failed process does not stop the others.
+        # Runs need no communication. The runtime is shut down here, so that a failed process does not stop the rest.
         jax.distributed.shutdown()
     except (RuntimeError, ValueError) as error:
         reason = str(error).splitlines()[0]

@@ -54,8 +54,8 @@ def design(ranges: dict[str, tuple[float, float]], rows: int, kind: str = "sobol
 
     Args:
         ranges: lower and upper bound of every parameter.
-        rows: number of rows. A grid has the same number of values of each parameter, and at most this number of rows.
-        kind: "grid", "latin" (hypercube) or "sobol" (balanced if `rows` is a power of 2). The last two use SciPy.
+        rows: number of rows. A grid may have fewer rows: every parameter has the same number of values.
+        kind: "grid", "latin" (hypercube) or "sobol" (sequence, balanced if `rows` is a power of 2).
         seed: random seed of "latin" and "sobol".
 
     Raises:
@@ -101,7 +101,7 @@ def write_table(file: Path, names: list[str], rows: np.ndarray, note: str) -> No
             raise InputError(
                 f"{file} exists and is not a table of `liverjax design`: give another file, or remove this file"
             )
-        if file.exists() and not file.is_file():  # e.g. the terminal or a pipe, which cannot be replaced
+        if file.exists() and not file.is_file():  # a terminal or a pipe cannot be replaced by a new file
             file.write_text(text, encoding="utf-8")
             return
         with whole(file) as beside:

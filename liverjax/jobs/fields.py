@@ -61,7 +61,7 @@ def fields(scene: Scene, result: Result, names: list[str], start: jax.Array | No
         scene: the scene of the run.
         result: the result of the run.
         names: some of `FIELDS`.
-        start: the positions (V, 3) [m] at which the run began, as for `simulate`; None: the reference positions.
+        start: the initial positions (V, 3) [m] of the run, as for `simulate`; None: the reference positions.
 
     Raises:
         InputError: a field is unknown, or needs a porous body that the scene does not have.
@@ -106,8 +106,8 @@ def _put_again(scene: Scene, sizes: Sizes, state: State, given: Any) -> tuple[St
 
 
 def _energy(scene: Scene, e: Equations, F: Matrix, pressure: jax.Array) -> Number:
-    """Return the energy density [J/m^3] of the law. The volumetric energy is that of the run: with averaged or mixed
-    volumes, the volume ratio of a single element may be far from the volume ratio that causes the pressure."""
+    """Return the energy density [J/m^3] of the law. With averaged or mixed volumes, the volumetric energy follows from
+    the pressures of the run, because the pressure does not follow from the volume ratio of a single element."""
     law = law_at_rest(scene)
     if not isinstance(e.volume, Averaged | Mixed):
         return law.strain_energy(law.measures(F))

@@ -1,4 +1,4 @@
-"""Run a scene in parts of some steps each. Finished parts stay on disk, so that a killed run can continue.
+"""Run a scene in parts of several steps. Finished parts stay on disk, so that a killed run can continue.
 
 A folder next to the output has one file per part. The file contains the results of the steps of this part, and the
 state after the last of these steps. Every part begins with a new tangent matrix, also in a run that is not stopped. So

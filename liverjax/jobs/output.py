@@ -77,7 +77,7 @@ def write_hdf5(
 
 
 def read_by_step(file: "h5py.File", name: str) -> np.ndarray:
-    """Read the numbers (T,) of T steps with a name of `BY_STEP` from result.h5: an attribute or, if long, a dataset."""
+    """Read a field of `BY_STEP` (T,) from result.h5. The field is an attribute or, if it is too long, a dataset."""
     return np.asarray(file.attrs[name] if name in file.attrs else file[name][()])
 
 

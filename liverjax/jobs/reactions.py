@@ -1,4 +1,4 @@
-"""Forces of the supports on the body over time, one for each support condition: the table of `reactions.csv`."""
+"""Forces of each support condition on the body over time: the table of `reactions.csv`."""
 
 from typing import Any
 
@@ -69,8 +69,8 @@ def held_forces(scene: Scene, reactions: np.ndarray) -> dict[str, np.ndarray]:
     for name, physics in slides.items():
         if physics.axis:
             continue
-        # If other conditions already constrain a node along every axis in which the normal has a component, the sliding
-        # support gets no force at this node.
+        # The normal has components along some axes. If other conditions already constrain a node along all of these
+        # axes, the sliding support gets no force at this node.
         nodes, normal = np.unique(np.asarray(physics.nodes)), np.asarray(physics.normal)
         loose = nodes[~taken[nodes][:, np.abs(normal) > 1e-12].all(axis=1)]
         found[name] = (reactions[:, loose] @ normal).sum(axis=1)[:, None] * normal

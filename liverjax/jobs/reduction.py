@@ -98,7 +98,7 @@ def tried(scene: Scene) -> Tried:
         again = time.perf_counter()
         found = jax.block_until_ready(simulate_reduced(model, plain))
         run_time = time.perf_counter() - again
-    compile_time = max(again - begin - run_time, 0.0)  # small if the compiled program was found on disk
+    compile_time = max(again - begin - run_time, 0.0)  # short if the compiled program was found on disk
     x, found = reduced_positions(model, plain, found), reduced_error(model, plain, found)
     error = np.asarray(found.error)
     moved = float(np.linalg.norm(np.asarray(x) - np.asarray(scene.mesh.points), axis=-1).max())

@@ -1,9 +1,10 @@
 """Sweeps: run one scene with many parameter sets. The process may be killed at any moment: finished results stay valid.
 
 The table has one parameter set per row. The sets are run in chunks. A finished chunk is a separate file in
-FILE.h5.parts, which is written under a temporary name and then renamed. When all chunks are finished, they are joined
-into FILE.h5. If a run is stopped, its finished chunks stay on disk, and `--resume` computes the other chunks. Several
-processes may work on one sweep: each of n processes computes every n-th chunk. The last process joins all parts.
+FILE.h5.parts. This file is written under a temporary name and then renamed. When all chunks are finished, they are
+joined into FILE.h5. If a run is stopped, its finished chunks stay on disk, and `--resume` computes the other chunks.
+Several processes may work on one sweep: each of n processes computes every n-th chunk. The last process joins all
+parts.
 """
 
 import csv
@@ -311,14 +312,15 @@ def _already(sweep: Sweep, out: Path, resume: bool) -> Done:
 
 
 def _differing(sweep: Sweep, stored: dict) -> list[str]:
-    """Return the input that differs from that of finished results. Chunks, versions and order of outputs may differ."""
+    """Return the names of the inputs that differ from the input `stored` of existing results. Chunk size, versions and
+    order of outputs are not compared."""
     own = json.loads(json.dumps(sweep.identity))
     other = [key for key in ("scene", "numbers", "parameters", "rows") if stored[key] != own[key]]
     return other + ["outputs"] * (set(stored["outputs"]) != set(own["outputs"]))
 
 
 def _remove_left(sweep: Sweep, folder: Path) -> None:
-    """Remove the parts of a finished sweep. They are there if a process was killed before it had removed them."""
+    """Remove the parts of a finished sweep. Such parts exist if a process was killed before it removed them."""
     with suppress(InputError, OSError), resumable_parts.locked(folder / "lock_join"):
         resumable_parts.same(sweep.identity, folder / "sweep.json")
         resumable_parts.remove(folder)

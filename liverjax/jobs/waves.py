@@ -33,7 +33,7 @@ from liverjax.waves.rest import under_its_weight
 
 #: The program warns if the reactions of the relaxed body and of the run differ by more than this fraction.
 _RESTED = 0.05
-#: The body oscillates about the end of a run with newton = "one_step" only if the residual is below this value.
+#: Maximum residual of the last step of a run with newton = "one_step", if the body is to vibrate about this state.
 _LARGEST_RESIDUAL = 1e-3
 #: Two reference shapes are equal if their nodes differ by less than this fraction of the largest coordinate. The
 #: roundoff of files in float32 is 1e-7.
@@ -41,7 +41,7 @@ _SAME_SHAPE = 1e-6
 
 
 class Waves(NamedTuple):
-    """Amplitudes of the harmonic motion of a scene, and the computing time [s]."""
+    """Amplitudes of the harmonic motion of a scene, their mesh error, the computing time [s], and warnings."""
 
     found: Harmonic
     mesh_error: HarmonicError | None
@@ -56,13 +56,13 @@ def solved_waves(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
         scene: `Scene`.
         about: result.h5 of a run with the same mesh and the same reference shape. The body vibrates about the last
             state of this run. If `about` is None, the body vibrates about the state of rest under gravity and
-            pre-tension, or about the reference shape.
+            pre-tension. If neither acts, it vibrates about the reference shape.
         mesh_error: whether to estimate the discretisation error of the mesh.
 
     Raises:
         InputError: `harmonic` cannot solve the scene, or the file `about` is not a result of this mesh.
     """
-    refuse_not_harmonic(scene)  # before the run under gravity, whose messages do not fit harmonic motion
+    refuse_not_harmonic(scene)  # first, because messages of the run under gravity do not fit harmonic motion
     x, reactions = (under_its_weight(scene), None) if about is None else _last_state(about, scene)
     begin = time.perf_counter()
     found = jax.block_until_ready(harmonic(scene, about=x))
@@ -72,7 +72,7 @@ def solved_waves(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
     if mesh_error:
         try:
             error = harmonic_errors(scene, found, about=x)
-        except InputError as e:  # the motion is known, only its mesh error is not
+        except InputError as e:  # the motion is returned without its mesh error
             said.append(str(e))
     if x is not None and reactions is not None:
         said += _of_rest(scene, x, reactions, f"--about {about}")
@@ -82,8 +82,8 @@ def solved_waves(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
 def _last_state(file: Path, scene: Scene) -> tuple[jax.Array, np.ndarray]:
     """Read positions [m] and reactions [N] (V, 3) of the last step in the file.
 
-    A reaction also balances the load at its node. So the reactions are NaN at held nodes where a traction of the run
-    acts.
+    A reaction also balances the traction at its node. So the reactions are NaN at held nodes under a traction of the
+    run.
     """
     import h5py
 
@@ -129,7 +129,8 @@ def _last_state(file: Path, scene: Scene) -> tuple[jax.Array, np.ndarray]:
 
 
 def _nodes_under_traction_of(text: str, scene: Scene) -> np.ndarray:
-    """Return the nodes under a traction in the scene file `text` of a run of the same mesh; none if it is not known."""
+    """Return the nodes under the tractions of a run on the same mesh. `text`: the scene file of this run. If it cannot
+    be used, no nodes are returned."""
     try:
         return nodes_under_traction(tomllib.loads(text.lstrip("\ufeff")), scene.mesh)
     except (tomllib.TOMLDecodeError, InputError):
@@ -137,7 +138,7 @@ def _nodes_under_traction_of(text: str, scene: Scene) -> np.ndarray:
 
 
 def _of_rest(scene: Scene, x: jax.Array, reactions: np.ndarray, name: str) -> list[str]:
-    """Return a warning if the reactions (V, 3) [N] of a run differ from those of the relaxed body at the positions x.
+    """Return a warning if the reactions (V, 3) [N] of a run differ from the reactions of the relaxed body at x.
 
     Components that are 0 or not known (NaN) in the run are not compared. If the reactions differ, the stress of the run
     also differs from the relaxed stress. There is no warning for a porous body.
@@ -151,7 +152,7 @@ def _of_rest(scene: Scene, x: jax.Array, reactions: np.ndarray, name: str) -> li
             f"whether the stress in the state of {name} is relaxed was not checked, because a traction of that run "
             "acts at all nodes with a reaction"
         ]
-    # A free component of a reaction is 0.
+    # Along a free axis, a reaction is 0.
     at = (pulled > 0.01 * pulled.max())[:, None] & (reactions != 0)
     # Membranes, ligaments, springs and obstacles also pull or push at fixed nodes. Sliding supports do not.
     pulling = tuple(own for own in scene.physics if not isinstance(own, SlidingSupport))

@@ -108,7 +108,7 @@ def pattern(tetrahedra: Indices, points: jax.Array) -> Pattern:
 
 
 def node_numbers(of: Any) -> jax.Array:
-    """Return a copy of an array as 32-bit integers. NumPy makes the copy. JAX would compile a program per shape.
+    """Return a copy of an array as 32-bit integers. NumPy makes it, because JAX would compile a program for each shape.
 
     The numbers are known inside jit, too.
     """
@@ -214,7 +214,7 @@ def _clustered(group: np.ndarray, pairs: np.ndarray, sources: tuple[np.ndarray, 
     size = np.bincount(group)
     if size.max(initial=0) < 2:
         return None
-    number = np.cumsum(size > 1) - 1  # number of each group, if only groups with several nodes are counted
+    number = np.cumsum(size > 1) - 1  # index of each group among the groups with several nodes
     order = np.argsort(group, kind="stable")
     place = np.empty(len(group), int)
     place[order] = np.arange(len(group)) - np.repeat(np.cumsum(size) - size, size)

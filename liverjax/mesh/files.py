@@ -27,9 +27,9 @@ CELLS = {1: "tetra", 2: "tetra10"}
 _NAMES = {1: "linear", 2: "quadratic"}
 #: Edges of a quadratic element in the order of VTK and meshio.
 _VTK = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
-#: An edge counts as curved if the distance between its midside node and its middle is above the fraction `_STRAIGHT` of
-#: its length. If the roundoff of coordinates with six digits (`SIX_DIGITS`) is above this limit, it is the new limit,
-#: but at most the fraction `_ROUNDED` of the length.
+#: An edge counts as curved if the distance between its midside node and its middle is above a limit. The limit is the
+#: roundoff of coordinates with six digits (`SIX_DIGITS`), but at least the fraction `_STRAIGHT` and at most the
+#: fraction `_ROUNDED` of the edge's length.
 _STRAIGHT, _ROUNDED = 1e-6, 1e-2
 
 
@@ -158,8 +158,7 @@ def _with_middles(points: np.ndarray, tets: np.ndarray, node_sets: dict, element
 def _permuted(points: np.ndarray, middles: np.ndarray) -> bool:
     """Return whether the points (E, 6, 3) [m] are the edge middles (E, 6, 3) [m] in another order.
 
-    This is the case if, at one of the six places in the order, most points are nearer to the middle of another edge of
-    their element.
+    This is the case if, for one of the six edges, most elements have its point nearer to the middle of another edge.
     """
     apart = [np.linalg.norm(points - middles[:, k : k + 1], axis=2) for k in range(6)]
     elsewhere = np.argmin(apart, axis=0) != np.arange(6)
@@ -233,7 +232,7 @@ _MOST_GROUPS = 100
 
 
 def _element_sets(data: Any, cell: str) -> dict[str, np.ndarray]:
-    """Return sets of tetrahedra from meshio's cell sets, cell data ``set:NAME``, and groups given by whole numbers.
+    """Return sets of tetrahedra from meshio's cell sets, cell data ``set:NAME``, and cell data with group numbers.
 
     The name of a group comes from the file (Gmsh's physical names). Otherwise, it is made from the name of the array
     and the group's number, e.g. ``medit:ref=2``.
@@ -286,7 +285,7 @@ def _middles(tets: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def _cell_groups(data: Any, cells: tuple[str, ...], dimension: int) -> dict[str, np.ndarray]:
-    """Return {name of a group: numbers of its cells}. All blocks with a type in `cells` are numbered consecutively.
+    """Return {name of a group: numbers of its cells}. Cells are counted over all blocks with a type in `cells`.
 
     A group of tetrahedra without a name is named by its number. A group of surface cells without a name is ignored.
     """
@@ -327,9 +326,9 @@ def _are_whole(values: np.ndarray) -> bool:
     return np.issubdtype(values.dtype, np.integer)
 
 
-#: File formats in which meshio does not write quadratic tetrahedra, or does not read them again.
+#: File formats without quadratic tetrahedra: meshio does not write them, or does not read them again.
 _LINEAR_ONLY = (".mesh", ".meshb", ".ugrid", ".node", ".ele", ".h5m", ".f3grid")
-#: Formats in which meshio does not read quadratic triangles again.
+#: File formats without quadratic triangles: meshio does not read them again.
 _NO_TRIANGLES = (".xdmf", ".xmf")
 
 

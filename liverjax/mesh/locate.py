@@ -11,14 +11,14 @@ from liverjax.mesh.tetrahedra import OF_AN_EDGE, SIX_DIGITS, TetMesh, roundoff_o
 
 #: A point is in a tetrahedron if all its barycentric coordinates are above minus this number.
 _INSIDE = 1e-9
-#: Two vertices coincide if their distance is below this fraction of the body's size, or below the roundoff of
-#: coordinates with six digits (`SIX_DIGITS`), but at most the fraction `OF_AN_EDGE` of the shortest edge at both.
+#: Two vertices coincide if their distance is below the limits of both vertices. The limit of a vertex is the roundoff
+#: of coordinates with six digits (`SIX_DIGITS`), but at most the fraction `OF_AN_EDGE` of its shortest edge, and at
+#: least the fraction `SAME_PLACE` of the body's size.
 SAME_PLACE = 1e-9
-#: A vertex lies on a face if its distance from the face is below a limit: `_ON_FACE` times the size of the face. If the
-#: roundoff of coordinates with six digits (`SIX_DIGITS`) is above the limit, it is the new limit, but at most 100 times
-#: the old limit.
+#: A vertex lies on a face if its distance from the face is below a limit. The limit is the roundoff of coordinates with
+#: six digits (`SIX_DIGITS`), but at least `_ON_FACE` times and at most 100 `_ON_FACE` times the size of the face.
 _ON_FACE = 1e-5
-#: Maximum number of vertices near a triangle. Only needle-like triangles have more. Such triangles are not searched.
+#: Maximum number of vertices near a triangle, in the search for hanging nodes. Only needle-like triangles have more.
 _MOST_NEAR = 200
 #: A piece of a line is ignored if it is shorter than this fraction of the line.
 _SHORTEST = 1e-9
@@ -50,8 +50,8 @@ def doubled_vertices(mesh: TetMesh) -> int:
 
 
 def hanging_vertices(mesh: TetMesh) -> int:
-    """Return the number of vertices that lie on a face or an edge of the boundary, but not at its corners (hanging
-    nodes). At such vertices, the mesh is not connected, because they are corners only of the elements on one side.
+    """Return the number of hanging nodes: vertices on a face or an edge of the boundary that are not corners of this
+    face or edge. There, the mesh is not connected, because the vertex is a corner only of the elements on one side.
     Needle-like triangles with more than `_MOST_NEAR` vertices nearby are not searched."""
     from scipy.spatial import cKDTree  # slow to import
 
@@ -71,8 +71,8 @@ def hanging_vertices(mesh: TetMesh) -> int:
 
 
 def _on_triangle(p: np.ndarray, corners: np.ndarray, away: np.ndarray) -> np.ndarray:
-    """Return whether each of n points p (n, 3) lies on its triangle with corners (n, 3, 3), but not at a corner.
-    `away` (n,): allowed distance, divided by the size of the triangle."""
+    """Return for each point p (n, 3) whether it lies on its triangle, but not at a corner. `corners` (n, 3, 3): corners
+    of the triangles. `away` (n,): allowed distance, divided by the size of the triangle."""
     a, b, c = np.moveaxis(corners, 1, 0)
     normal = np.cross(b - a, c - a)
     square = np.sum(normal**2, axis=1)

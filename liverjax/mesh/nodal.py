@@ -77,7 +77,7 @@ def nodal_volumes(mesh: TetMesh) -> jax.Array:
 
 
 def lumped_sums(mesh: TetMesh, size: jax.Array) -> jax.Array:
-    """Return the sums (V,) at the nodes if each element shares its number `size` (E,) like a lumped mass."""
+    """Divide each element's `size` (E,) among its nodes like a lumped mass. Return the sums (V,) at the nodes."""
     return _weighted_parts(mesh, _LUMPED[min(mesh.order, 2)], size)
 
 
@@ -90,9 +90,9 @@ def load_volumes(mesh: TetMesh) -> jax.Array:
 def weighing_masses(mesh: TetMesh, density: Number, mass: str) -> jax.Array:
     """Return the weight of the body at its nodes, divided by gravity (V,) [kg].
 
-    If a quadratic body or a body with consistent masses has one density per node, each element has one density
-    (`element_density`). So its total weight is its total mass times gravity, and a free body with linear elements or
-    with consistent masses falls without deformation.
+    If the density is given per node, and the body has quadratic elements or consistent masses, each element gets one
+    density (`element_density`). So its total weight is its total mass times gravity, and a free body with linear
+    elements or with consistent masses falls without deformation.
 
     Args:
         density: one number, or one for each node (V,) [kg/m^3].
@@ -104,7 +104,7 @@ def weighing_masses(mesh: TetMesh, density: Number, mass: str) -> jax.Array:
 
 
 def _shared_as_loads(mesh: TetMesh, size: jax.Array) -> jax.Array:
-    """Return the sums (V,) at the nodes if each element shares its number `size` (E,) like a uniform load."""
+    """Divide each element's `size` (E,) among its nodes like a uniform load. Return the sums (V,) at the nodes."""
     total = _weighted_parts(mesh, _INTEGRALS[mesh.order], size)
     if mesh.order < 3:
         return total
@@ -113,7 +113,7 @@ def _shared_as_loads(mesh: TetMesh, size: jax.Array) -> jax.Array:
 
 
 def element_density(mesh: TetMesh, density: jax.Array) -> jax.Array:
-    """Return the density (E,) [kg/m^3] of every element: the lumped mass of its nodes, divided by its volume.
+    """Return the density (E,) [kg/m^3] of every element: the sum of its lumped masses, divided by its volume.
 
     `density`: one number for each node (V,).
     """
@@ -135,8 +135,8 @@ def mass_parts(order: int) -> tuple[np.ndarray, np.ndarray]:
     """Split the consistent mass matrix of an element, divided by its mass, into a diagonal and a remainder.
 
     For n nodes of the element, the diagonal has the shape (n,) and the remainder has the shape (n, n). The diagonal is
-    the lumped mass. Functions of order 3 have no lumped mass, so their diagonal entries are those of the consistent
-    mass matrix.
+    the lumped mass. Functions of order 3 have no lumped mass: they keep the diagonal entries of the consistent mass
+    matrix.
     """
     whole = products(order)
     parts, lumped = np.diag(whole).copy(), _LUMPED[min(order, 2)]

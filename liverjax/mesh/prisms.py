@@ -4,7 +4,7 @@ import numpy as np
 
 
 def stacked(plane: np.ndarray, triangles: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (n L, 3) [m] and tetrahedra (3 m (L - 1), 4) between planes of n nodes at L heights.
+    """Return the points (n L, 3) [m] of L planes with n nodes each, and the tetrahedra (3 m (L - 1), 4) between them.
 
     Args:
         plane: x and y of the nodes in every plane (n, 2) [m].
@@ -22,8 +22,8 @@ def _split(prisms: np.ndarray) -> np.ndarray:
 
     On each side of a prism, the diagonal starts at the node with the lowest number, so neighbouring prisms match.
     """
-    # Rotate each prism so that its bottom node with the lowest number is first. Then only the diagonal of the opposite
-    # side differs between prisms.
+    # Rotate each prism so that its bottom node with the lowest number is first. Then prisms differ only in the diagonal
+    # of the side opposite to this node.
     shift = np.argmin(prisms[:, :3], axis=1)
     turn = (np.arange(3)[None] + shift[:, None]) % 3
     a, b, c = np.take_along_axis(prisms[:, :3], turn, axis=1).T

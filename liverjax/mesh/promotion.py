@@ -88,8 +88,8 @@ def middles_of_places(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
 def _inner_faces(mesh: TetMesh, surface: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the faces (m, 3) inside the body that belong to a region (see `middles_of_places`).
 
-    The first array contains the faces near a vertex below the surface, and the second one the faces where the body is
-    only one element thick. A face may be in both arrays, and occurs once for each of its elements.
+    The first array contains the faces near a vertex below the surface. The second array contains the faces where the
+    body is only one element thick. A face may be in both arrays, and occurs once for each of its elements.
     """
     V, tets = mesh.number_of_vertices, np.asarray(mesh.tetrahedra).astype(np.int64)
     held = inside[tets]
@@ -107,10 +107,10 @@ def middles_between(mesh: TetMesh, groups: list[np.ndarray]) -> np.ndarray:
     """Return the node numbers (V + edge number) of the edge middles on faces between groups of vertices.
 
     Such a face has all its vertices in the groups, but not in one group. On the surface, it continues a region of one
-    group (`middles_of_places`): it is nearly parallel to a neighbour in this region, or to a neighbour that continues
-    it. Inside the body, one of its vertices is below the surface, or has an edge to a vertex of a group below the
-    surface. All groups without a surface triangle, for example single rows of nodes, count as one group, and its own
-    edge middles are in the result.
+    group (`middles_of_places`): it is nearly parallel to a neighbour in this region, or to a neighbour that already
+    continues the region. Inside the body, one of its vertices is below the surface, or has an edge to a vertex of a
+    group below the surface. Groups that contain no surface triangle, for example single rows of nodes, are joined to
+    one group. The result also contains the edge middles on the regions of this joined group.
     """
     V = mesh.number_of_vertices
     inside = np.zeros((len(groups), V), bool)
@@ -152,7 +152,7 @@ def _continued(mesh: TetMesh, surface: np.ndarray, inside: np.ndarray) -> np.nda
 
 
 def _and_neighbours(mesh: TetMesh, inside: np.ndarray) -> np.ndarray:
-    """Return the mask `inside` (V,) of vertices, extended by all vertices that an edge connects with one of them."""
+    """Return the mask `inside` (V,) of vertices, extended by all vertices with an edge to one of these vertices."""
     low, high = np.asarray(mesh.pattern.edges)
     found = inside.copy()
     found[low[inside[high]]] = True

@@ -12,7 +12,7 @@ from liverjax.mesh.shape_functions import FACES
 from liverjax.mesh.tetrahedra import FACES as OUTWARD
 from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
-#: Even permutations of the corners of an element. Each leads to a different inner diagonal (`corner_orders`).
+#: Three even permutations of the corners of an element. Each leads to a different inner diagonal (`corner_orders`).
 _ORDERS = np.array([[0, 1, 2, 3], [0, 2, 3, 1], [0, 3, 1, 2]])
 
 
@@ -124,8 +124,8 @@ def barycentric_in_parts(mesh: TetMesh, element: Indices, L: np.ndarray) -> np.n
 
 
 def _places_of_parts() -> np.ndarray:
-    """Return the barycentric coordinates (8, 4, 4) of the four corners of each part, for ordered corners of the
-    element."""
+    """Return the barycentric coordinates (8, 4, 4) of the four corners of each part, if the element's corners are in
+    the order of `corner_orders`."""
     return _corners_of_parts(*np.eye(4), *(np.eye(4)[[i, j]].mean(axis=0) for i, j in PAIRS))
 
 
@@ -176,17 +176,17 @@ def _eighths(mesh: TetMesh, middle: np.ndarray) -> np.ndarray:
 
 
 def corner_orders(mesh: TetMesh) -> np.ndarray:
-    """Return the order (4, E) of the four corners a, b, c, d in which each element is cut, as numbers from 0 to 3.
+    """Return the local numbers (4, E) of the corners a, b, c, d of each element, in the order that `_eighths` needs.
 
     The inner diagonal joins the middles of the edges a c and b d. In this order it is the shortest of the three inner
-    diagonals. If the positions are unknown (inside jit, grad or vmap), the order is that of the mesh.
+    diagonals. If the positions are unknown (inside jit, grad or vmap), the order is the order in the mesh.
     """
     E = mesh.number_of_elements
     if isinstance(mesh.points, jax.core.Tracer):
         return np.tile(_ORDERS[0][:, None], E)
     a, b, c, d = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)].transpose(1, 0, 2)
     diagonals = np.linalg.norm([a + c - b - d, a + d - b - c, a + b - c - d], axis=2)
-    # Of diagonals with equal length, apart from the roundoff of float32, the first is taken on all machines.
+    # If diagonals have equal lengths up to the roundoff of float32, the first one is used, so that all machines agree.
     shortest = diagonals <= (1 + 1e-5) * diagonals.min(axis=0)
     return _ORDERS[shortest.argmax(axis=0)].T
 
@@ -194,8 +194,8 @@ def corner_orders(mesh: TetMesh) -> np.ndarray:
 def _corners_of_parts(a: Array, b: Array, c: Array, d: Array, *middles: Array) -> np.ndarray:
     """Return the corners (8, 4, …) of the eight parts of an element, from its corners a, b, c, d and edge middles.
 
-    The order of the corners of each part is that of Bey, so that repeated refinement has at most three different shapes
-    of elements. Where this order has a negative volume, the first and the third corner are exchanged.
+    The corners of each part are in the order of Bey, so that repeated refinement makes at most three different shapes
+    of each element. Where this order has a negative volume, the first and the third corner are exchanged.
     """
     ab, ac, ad, bc, bd, cd = middles
     return np.array(
@@ -236,7 +236,7 @@ def _halved(mesh: TetMesh, near: np.ndarray) -> np.ndarray:
 
 
 def _bisected(mesh: TetMesh, middle: np.ndarray) -> np.ndarray:
-    """Cut each element in two at its longest halved edge, until no such edge is left. Return the elements (m, 4).
+    """Cut elements in two at their longest halved edge, until no element has a halved edge. Return elements (m, 4).
 
     `middle` (N,): number of the node at the middle of each edge, negative for edges that are not halved.
     """

@@ -66,8 +66,8 @@ def select(
 
 
 def _warn_of_millimetres(x: np.ndarray, key: str, bound: float, name: str) -> None:
-    """Warn if a bound excludes no node and is far outside of the mesh, but would lie within it if it were in
-    millimetres. 0.01, 0.1 and 1 m give no warning, because people use them to select everything."""
+    """Warn if a bound excludes no node and is far outside of the mesh, but would lie within the mesh if it were in
+    millimetres. The bounds 0.01, 0.1 and 1 m give no warning, because users write them to select all nodes."""
     low, high = x.min(), x.max()
     idle = bound > high if key.endswith("max") else bound < low
     far = abs(bound) > FAR_OUTSIDE * max(abs(low), abs(high)) and abs(bound) not in (0.01, 0.1, 1.0)
@@ -80,7 +80,8 @@ def _warn_of_millimetres(x: np.ndarray, key: str, bound: float, name: str) -> No
 
 
 def boundary_triangles(mesh: TetMesh, nodes: Indices | None = None) -> np.ndarray:
-    """Return the outer triangles (m, 3), with outward normals. With `nodes`: only those with all corners in `nodes`."""
+    """Return the surface triangles (m, 3), with outward normals. If `nodes` is given, return only the triangles with
+    all corners in `nodes`."""
     tets = np.asarray(mesh.tetrahedra)
     faces = np.concatenate([tets[:, f] for f in FACES])
     codes = face_codes(np.sort(faces.astype(np.int64), axis=1), mesh.number_of_vertices)
@@ -101,12 +102,13 @@ def face_codes(triples: np.ndarray, V: int) -> np.ndarray:
 
 
 def surface_of(mesh: TetMesh, nodes: Indices | None, set: str | None = None) -> np.ndarray:
-    """Return outer triangles (m, 3) with all vertices in `nodes`. If `set` is a triangle set, use only its triangles.
+    """Return surface triangles (m, 3) with all vertices in `nodes`. If `set` is a triangle set, return only its
+    triangles.
 
     Args:
         mesh: `TetMesh`.
         nodes: nodes of a region of the surface, from `select`. None means the whole surface.
-        set: name of the set with which the region was selected, if any.
+        set: name of the set that selected the region, if any.
     """
     triangles, groups = boundary_triangles(mesh, nodes), mesh.triangle_sets or {}
     if set is None or set not in groups:
@@ -152,7 +154,7 @@ def check_triangles(mesh: TetMesh, triangles: Indices, name: str, outward: bool 
     Args:
         mesh: `TetMesh`.
         triangles: node numbers (m, 3).
-        name: name of the triangles, with which the message begins.
+        name: name of the triangles, at the beginning of the message.
         outward: whether the triangles must lie on the surface, in an order with outward normals.
 
     Raises:

@@ -66,7 +66,7 @@ def cylinder(
         match_area: whether each polygon has the area of its circle.
 
     Without `rim_cell`, `rings` and `match_area`, ring k has 6 k nodes. Without `match_area`, the corners of a ring lie
-    on its circle. The volume is then smaller than that of the cylinder by O(cell_size^2).
+    on its circle. The mesh then has less volume than the cylinder, with a difference of O(cell_size^2).
 
     Raises:
         InputError: a length is not positive, or a ring is outside the cylinder.
@@ -93,7 +93,7 @@ def cylinder(
 def _graded(
     radius: float, height: float, cells: tuple[float, float], rings: Sequence[float], match_area: bool
 ) -> TetMesh:
-    """Mesh a cylinder with two cell lengths `cells` [m]: the second at its rims and at `rings`, the first elsewhere."""
+    """Mesh a cylinder. `cells`: cell length [m] far from its rims and from `rings`, and cell length [m] near them."""
     cell_size, rim_cell = cells
     _positive("rim_cell", [rim_cell])
     for ring in rings:
@@ -102,7 +102,7 @@ def _graded(
                 f"shape rings = {list(rings)} must lie between 0 and the radius {radius:g}: correct these numbers"
             )
     largest = min(cell_size, radius / 2)
-    # A ring of radius r has at least 2 pi r / largest cells. This gives a lower bound of the number of tetrahedra.
+    # A ring of radius r has at least 2 pi r / largest edges. This gives a lower bound of the number of tetrahedra.
     _not_too_many(18 * math.ceil(radius / largest) ** 2 * math.ceil(height / cell_size), "radius, height and cell_size")
     _not_too_many(18 * math.ceil(min(radius, height) / rim_cell) ** 2 // 100, "rim_cell")
     radii = graded(radius, dict.fromkeys([*map(float, rings), float(radius)], rim_cell), largest)
@@ -131,7 +131,7 @@ def _disc(rings: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _not_too_many(tetrahedra: int, names: str) -> None:
-    """Raise `InputError`, before a mesh is made, if it would have more than `MOST_TETRAHEDRA` elements."""
+    """Raise `InputError` if the planned mesh would have more than `MOST_TETRAHEDRA` elements."""
     if tetrahedra > MOST_TETRAHEDRA:
         remedy = (
             "give fewer cells" if names == "cells" else "use larger cells, or give lengths in metres, or add the unit"

@@ -146,8 +146,8 @@ def _quadratic(l: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
 
 
 def _ten_functions(l: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return ten functions (10, Q) and their derivatives: the functions of `_quadratic`, then those of order 3 on the
-    edges and on the face. The argument and the form of the result are the same as for `_quadratic`."""
+    """Return ten functions (10, Q) and their derivatives: the functions of `_quadratic`, then the functions of order 3
+    on the edges and on the face. The argument and the form of the result are the same as for `_quadratic`."""
     N, slopes = _quadratic(l)
     zero = np.zeros_like(l[0])
     more, by = [], []

@@ -58,7 +58,7 @@ class TetMesh:
 
     @property
     def number_of_vertices(self) -> int:
-        """Number of vertices of elements. The vertices are the first nodes."""
+        """Number of vertices (corners of elements). The vertices are the first nodes."""
         return self.pattern.row_nodes.shape[1]
 
     @property
@@ -165,7 +165,7 @@ class TetMesh:
         """Multiply values (n, C, E) of n functions and C components by the signs of the functions.
 
         A function of order 3 on an edge has a direction, towards the vertex with the higher number. If this vertex is
-        the first one of the edge in the local numbering of the element, the sign of the function in this element is -1.
+        the first end of the edge in the local numbering of the element, the sign of the function in this element is -1.
         """
         if self.order < 3:
             return values
@@ -299,10 +299,10 @@ OF_AN_EDGE = 1e-3
 
 
 def roundoff_of(mesh: TetMesh, relative: float = SIX_DIGITS) -> float:
-    """Return the distance [m] below which two places in a mesh are regarded as the same place.
+    """Return a tolerance [m]: two places in a mesh are regarded as the same place if their distance is below it.
 
-    It is the fraction `relative` of the largest coordinate, but at most the fraction `OF_AN_EDGE` of the shortest edge,
-    and at least 1e-9 of the mesh's size.
+    The tolerance is the fraction `relative` of the largest coordinate, but at most the fraction `OF_AN_EDGE` of the
+    shortest edge, and at least 1e-9 of the mesh's size.
     """
     points, (low, high) = np.asarray(mesh.points), np.asarray(mesh.pattern.edges)
     shortest = np.linalg.norm(points[high] - points[low], axis=1).min()
@@ -311,11 +311,11 @@ def roundoff_of(mesh: TetMesh, relative: float = SIX_DIGITS) -> float:
 
 
 def tolerance_of_bounds(mesh: TetMesh) -> float:
-    """Return the distance [m] from a bound at which a node still lies on the bound: 1e-9 of the mesh's size.
+    """Return the maximum distance [m] between a bound and a node on this bound: 1e-9 of the mesh's size.
 
-    If the file gave the coordinates in single precision, in one of the `UNITS`, it is the roundoff of this precision.
+    If the coordinates are single-precision numbers in one of the `UNITS`, and not short decimals, it is the roundoff.
     """
-    points = np.asarray(mesh.points, float)[: mesh.number_of_vertices]  # midside nodes may be computed
+    points = np.asarray(mesh.points, float)[: mesh.number_of_vertices]  # not midside nodes: they may be computed
 
     def are(rounded: np.ndarray) -> bool:
         return bool(np.all(np.abs(rounded - points) <= 1e-15 * np.abs(points)))

@@ -22,7 +22,7 @@ from liverjax.scenes.scene import Scene
 from liverjax.simulation.equations import State, initial_state
 from liverjax.simulation.run import prepared, simulate_part
 
-#: Number of steps of the scene. It is so large that the run never ends.
+#: Number of steps of the scene, so large that the run never ends.
 STEPS = 10**9
 #: Rest length of the spring, divided by the size of the body. A spring of length 0 would have no direction.
 SLACK = 1e-3
@@ -83,8 +83,8 @@ def at_rest(scene: Scene) -> Playing:
 
 
 def _with_histories(scene: Scene) -> Scene:
-    """Return the scene with a history for prescribed motions and forces that grow until the last step. With this
-    history, these motions and forces grow during the planned time of the scene, and are constant afterwards."""
+    """Return the scene with a history for prescribed motions and forces that have none. Without a history they would
+    grow until step `STEPS`. With it, they grow during the planned time of the scene, and are constant afterwards."""
     if scene.solve.dt is None:
         return scene
     table = {"times": scene.solve.steps * scene.solve.dt * jnp.array([0.0, 1.0]), "history": jnp.array([0.0, 1.0])}
@@ -131,7 +131,7 @@ def pulled(playing: Playing, node: int | None = None, to: np.ndarray | None = No
         spring = replace(
             spring, nodes=jnp.full((1, 1), node, jnp.int32), to=jnp.asarray(end), stiffness=jnp.asarray(stiffness)
         )
-    # The compiled program needs arrays with the precision for which it was compiled.
+    # The compiled program needs arrays with the same precision as at its compilation.
     spring = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), spring, playing.scene.physics[-1])
     scene = replace(playing.scene, physics=(*others, spring))
     first = STEPS if playing.scene.solve.dt is None else playing.step + 1  # the full load acts at step STEPS

@@ -1,9 +1,9 @@
-"""Supports and motions of the new nodes between two entries, for example between two `[[fixed]]` entries of one clamp.
+"""Constrain the new nodes between two entries of a scene, for example between two `[[fixed]]` entries of one clamp.
 
-A sliding support is also such an entry.
-Each entry of a scene gets the new nodes between its own nodes. On a strip of triangles between two entries, the run
-prescribes the motion of all nodes. So the new nodes on this strip move as these triangles do in the run. Between two
-entries with given pressures of the fluid, the new nodes get the pressures of the run.
+A sliding support is also such an entry. Each entry of a scene gets the new nodes between its own nodes. On a strip of
+triangles between two entries, the run prescribes the motion of all nodes. So the new nodes on this strip get the motion
+of its triangles in the run. Between two entries with given pressures of the fluid, the new nodes get the pressures of
+the run.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ from liverjax.scenes.scene import Scene
 
 #: Two normals are parallel if the sine of their angle is below this value.
 _SAME_NORMAL = 1e-6
-#: Weights of old nodes at a new node are roundoff if they are below this value.
+#: Weights of old nodes at a new node, and components of unit normals, count as 0 if they are below this value.
 _SOME_WEIGHT = 1e-9
 
 
@@ -41,12 +41,12 @@ def joined_entries(
 
     Args:
         old, made: the scene before and after the conversion.
-        between: function of the old nodes of several entries -> the new nodes on the regions that they form together.
-        field: function of the values (V,) at the old nodes -> the values (V',) at the new nodes.
+        between: function that returns, for the old nodes of several entries, the new nodes on their joint regions.
+        field: function that returns, for values (V,) at the old nodes, the values (V',) at all nodes of `made`.
     """
     if isinstance(old.mesh.points, jax.core.Tracer):
         return made
-    still, displaced = dict[tuple[int, ...], str](), made.displaced  # still: nodes that stay, and their axes
+    still, displaced = dict[tuple[int, ...], str](), made.displaced  # still: {nodes: axes without motion}
     for axis in AXES:
         own = _entries_along(old, axis)
         if len(own) < 2:
@@ -80,8 +80,8 @@ def joined_entries(
 def joined_inlets(old: Scene, made: Porosity) -> tuple[Inlet, ...]:
     """Return the inlets of `made`, and inlets for the new vertices between drained nodes and inlets of `old`.
 
-    `made` is the porosity on the refined mesh. A new vertex has the mean pressure of the ends of its edge, also if an
-    entry of `made` gives it another pressure, since entries with common nodes overlap. Between two inlets with
+    `made` is the porosity on the refined mesh. A new vertex has the mean pressure of the ends of its edge. If an entry
+    of `made` gives it another pressure (entries may overlap), this pressure is replaced. Between two inlets with
     different histories, no pressure is added. If the positions of the mesh are unknown (inside jit, grad or vmap), no
     inlet is added.
     """
@@ -92,7 +92,7 @@ def joined_inlets(old: Scene, made: Porosity) -> tuple[Inlet, ...]:
     edges = np.asarray(mesh.pattern.edges)
     owner, by_made = np.full(V, -1), np.full(V + edges.shape[1], -1)
     for k, ((_, nodes), (_, wider)) in enumerate(zip(given, taken, strict=True)):
-        owner[nodes[nodes < V]] = k  # where two inlets have a common node, the later one counts
+        owner[nodes[nodes < V]] = k  # at a common node of two inlets, the later inlet counts
         by_made[wider[wider < len(by_made)]] = k
     new = np.union1d(middles_between(mesh, [nodes for _, nodes in given]), V + np.flatnonzero(by_made[V:] >= 0))
     ends = np.sort(owner[edges[:, new - V]], axis=0)
@@ -101,7 +101,7 @@ def joined_inlets(old: Scene, made: Porosity) -> tuple[Inlet, ...]:
     more = []
     for k, m in np.unique(ends, axis=1).T:
         own = node_numbers(new[(ends[0] == k) & (ends[1] == m)])
-        first, last = given[k][0], given[m][0]  # the drained nodes have number 0: if `last` is drained, both are
+        first, last = given[k][0], given[m][0]  # drained: number 0, so `last` is drained only if both are
         if last is None:
             more.append(Inlet(nodes=own, pressure=0.0))
         elif first is None:
@@ -120,7 +120,7 @@ def _given_pressures(porosity: Porosity) -> list[tuple[Inlet | None, np.ndarray]
 
 
 def _entries_along(scene: Scene, axis: str) -> list[Fixed | Displaced]:
-    """Return the entries that constrain an axis. A sliding support along this axis counts as a fixed entry."""
+    """Return the entries that constrain an axis. A sliding support with this normal counts as a fixed entry."""
     supports = [own for own in scene.physics if isinstance(own, SlidingSupport) and own.axis == axis]
     slides = [Fixed(nodes=own.nodes, axes=axis) for own in supports]
     entries: tuple[Fixed | Displaced, ...] = (*slides, *scene.fixed, *scene.displaced)
@@ -183,7 +183,7 @@ def _same(a: object, b: object) -> bool:
 def _amounts(entry: Displaced, axis: str, where: np.ndarray) -> jax.Array:
     """Return the displacement [m] along an axis at the nodes of the mask `where` (V,), and 0 at other nodes.
 
-    If the history contains the displacements, the result is the factor 1 of this history.
+    If the history itself contains the displacements, the result at these nodes is 1, the factor of this history.
     """
     values = jnp.ones(()) if entry.by is None else jnp.asarray(entry.by)[..., AXES.index(axis)]
     nodes = np.asarray(entry.nodes)

@@ -42,8 +42,8 @@ def by_element(scene: Scene) -> Scene:
 def law_of_elements(law: Law, regions: tuple[Region, ...], number_of_elements: int) -> Law:
     """Return the law of the body: the law of the scene, with the parameters and laws of its regions.
 
-    A parameter has one value per element (E,), and a direction one row per element (E, 3), if a region changes it. If a
-    region has a complete law, the result is a `ByRegion` of all laws.
+    A parameter that a region changes has one value per element (E,). A direction that a region changes has one row per
+    element (E, 3). If a region has a complete law, the result is a `ByRegion` of all laws.
 
     Raises:
         InputError: a region changes a parameter that the law does not have.

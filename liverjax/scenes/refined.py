@@ -142,7 +142,7 @@ def _mesh_and_within(old: TetMesh) -> tuple[TetMesh, Within]:
 
 def _with_nodes_between(old: TetMesh, mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
     """Return the node numbers `nodes`, and the numbers of the new nodes that lie between them (see
-    `middles_of_places`). This is for pressures, which are linear along the edges of linear and quadratic elements."""
+    `middles_of_places`). It is used for pressures: they are linear along the edges of linear and quadratic elements."""
     found = np.concatenate([nodes, np.setdiff1d(middles_of_places(old, nodes), nodes)])
     if mesh.order == 1:
         return found
@@ -150,7 +150,7 @@ def _with_nodes_between(old: TetMesh, mesh: TetMesh, nodes: np.ndarray) -> np.nd
 
 
 def _between_nodes(old: TetMesh, mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
-    """Return the new nodes whose motion the motion of the old nodes `nodes` prescribes.
+    """Return the new nodes that an entry with the old nodes `nodes` also constrains.
 
     With linear elements, see `middles_of_places`. With quadratic elements, see `middles_of_whole_faces`.
     """
@@ -160,7 +160,7 @@ def _between_nodes(old: TetMesh, mesh: TetMesh, nodes: np.ndarray) -> np.ndarray
 
 
 def _between_groups(old: TetMesh, mesh: TetMesh, groups: list[np.ndarray]) -> np.ndarray:
-    """Return the new nodes whose motion several groups of old nodes prescribe together."""
+    """Return the new nodes that several entries with these groups of old nodes constrain together."""
     if mesh.order == 1:
         return middles_between(old, groups)
     return middles_of_whole_faces(old, mesh, np.concatenate(groups))
@@ -171,7 +171,7 @@ def _of_parts(E: int, numbers: T) -> T:
 
     def one(a: Number) -> Number:
         shape = jnp.shape(a)
-        if shape[-2:] == (E, 3):  # comes first, because a body of three elements has arrays (3, 3) of directions
+        if shape[-2:] == (E, 3):  # first, because three elements have directions of shape (3, 3)
             return jnp.repeat(jnp.asarray(a), 8, axis=-2)
         return jnp.repeat(jnp.asarray(a), 8, axis=-1) if shape[-1:] == (E,) else a
 
@@ -182,7 +182,8 @@ def _density_of_parts(old: TetMesh, mesh: TetMesh, density: jax.Array) -> jax.Ar
     """Return the density (V',) at the new nodes of quadratic elements.
 
     Quadratic shape functions may be negative. So the density (V,) at the old nodes is interpolated linearly along the
-    edges of the parts, and then multiplied by the mean of one factor per element. The total mass does not change.
+    edges. Each element has a factor that restores its mass, and the density at a node is multiplied by the mean factor
+    of its elements. The total mass does not change.
     """
     linear = on_middles(mesh, density)
     parts = (element_density(mesh, linear) * mesh.volumes).reshape(-1, 8)

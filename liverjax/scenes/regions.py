@@ -72,7 +72,8 @@ _APART = 0.02
 
 
 def _warn_of_cut_elements(mesh: TetMesh, elements: np.ndarray, where: dict[str, float], name: str) -> None:
-    """Warn if a bound of `where` cuts elements. The region does not contain cut elements, so it is too small."""
+    """Warn if a bound of `where` cuts elements. The region does not contain cut elements, so it is smaller than its
+    bounds."""
     points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     tolerance = tolerance_of_bounds(mesh)
     inside = {

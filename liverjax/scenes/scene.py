@@ -118,15 +118,15 @@ class Scene:
     traction: tuple[Traction, ...] = param("1", "loads", default=())
     physics: tuple[Physics, ...] = unnamed("further physics: supports, …", places="named", default=())
     solve: Solve = param("1", "how it is solved", default=Solve())
-    #: Law before its stress relaxed, if `law` is relaxed (`liverjax.simulation.unloaded.resting`). The default
-    #: stiffness of obstacles and the terms of mixed elements depend on this law, so that they are those of the run.
+    #: The law before relaxation, if `law` is the relaxed law (`liverjax.simulation.unloaded.resting`). The default
+    #: stiffness of obstacles and the terms of mixed elements depend on this law, as in the run.
     unrelaxed: Law | None = param("1", "law before its stress relaxed; None: the law itself", default=None)
     points_are: str = static(
         default="reference", about="reference: the mesh is unloaded; loaded: the mesh is the shape under the loads"
     )
 
     def named(self, section: str) -> list[int]:
-        """Return the indices in `physics` of the objects whose table in scene files is [[section]]."""
+        """Return the indices in `physics` of the objects with the table [[section]] in scene files."""
         return [k for k, physics in enumerate(self.physics) if physics.section == section]
 
 

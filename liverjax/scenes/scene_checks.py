@@ -25,8 +25,8 @@ from liverjax.scenes.scene import Scene, named_physics
 
 def check_before_run(scene: Scene) -> None:
     """Check choices, bounds of numbers, nodes, regions and the objects in `scene.physics`. Arrays inside jit are not
-    checked. The check compiles nothing. The shear modulus of the law is not computed: call `check_scene` to
-    refuse a negative one.
+    checked. The check compiles nothing. The shear modulus of the law is not computed: `check_scene` refuses a negative
+    shear modulus.
 
     Raises:
         InputError: see `check_choices` and `check_bounds`; a node is not in the mesh; an element is inverted; a node is
@@ -42,7 +42,7 @@ def check_before_run(scene: Scene) -> None:
     check_normals(scene)
     if _are_known([region.elements for region in scene.region]):
         check_region_elements(scene)
-    with jax.ensure_compile_time_eval():  # a check may use JAX, and its numbers are known
+    with jax.ensure_compile_time_eval():  # checks may use JAX on these known numbers
         for name, physics in named_physics(scene):
             if _are_known((physics, scene.mesh)):
                 physics.check(scene.mesh, name)

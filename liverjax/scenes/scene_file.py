@@ -86,7 +86,7 @@ def load_scene(path: str | Path) -> Scene:
         raise InputError(f"{path} cannot be read ({error.strerror}): give a scene file (TOML)") from None
     except UnicodeDecodeError:
         raise InputError(f"{path} is not a text file: give a scene file (TOML)") from None
-    except ValueError as error:  # also a whole number with more digits than Python reads
+    except ValueError as error:  # also for a whole number with too many digits
         raise InputError(f"{path} is not valid TOML ({error}): correct this line") from None
     try:
         return scene_from(content, path.parent)
@@ -125,7 +125,7 @@ def scene_from(content: Content, folder: Path = Path()) -> Scene:
 
 
 def nodes_under_traction(content: Content, mesh: TetMesh) -> np.ndarray:
-    """Return the numbers of the nodes of all triangles on which a [[traction]] of a scene file acts.
+    """Return the numbers of the nodes of all triangles with a [[traction]] in a scene file.
 
     Args:
         content: content of the scene file.
@@ -262,7 +262,7 @@ def _linear_mesh(table: dict, folder: Path) -> TetMesh:
 
 
 def _cylinder(table: dict, scale: float) -> TetMesh:
-    """Make the mesh of a cylinder. Optional keys refine it near rims and rings, or give it the area of the circle."""
+    """Make the mesh of a cylinder. Optional keys refine it near rims and rings, or give polygons the circle's area."""
     for key in ("radius", "height", "cell_size"):
         if key not in table:
             raise InputError(f"[mesh] shape = 'cylinder' needs {key}: give a length")
@@ -393,7 +393,7 @@ def _inlet(mesh: TetMesh, name: str, table: object) -> Inlet:
 
 
 def _drained(mesh: TetMesh, given: Any) -> jax.Array:
-    """Return the nodes of one region of the boundary, or those of all regions in a list."""
+    """Return the nodes of one region of the boundary, or the nodes of all regions in a list."""
     if given == []:
         raise InputError("porosity.drained = [] selects no nodes: give [{z_max = 0.0}], or remove drained (sealed)")
     name = "porosity.drained"
@@ -420,7 +420,7 @@ def _read_body(table: dict) -> Body:
 
 
 def _history(name: str, table: dict, forms: tuple[int, ...] = (1, 3)) -> dict[str, jax.Array]:
-    """Return times and values of the history in a table, by name, or an empty dictionary if there is no history."""
+    """Return {"times": …, "history": …} for the history in a table, or an empty dictionary if there is no history."""
     if "history" not in table:
         return {}
     times, numbers = history.read_history(table["history"], name, forms)

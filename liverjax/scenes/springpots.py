@@ -66,7 +66,7 @@ def check_spring_at_rest(own: SpringpotSeries | None, otherwise: str) -> None:
     checked.
 
     Args:
-        own: the springpots; None is always right.
+        own: the springpots; None is always accepted.
         otherwise: what the user can do instead of a larger spring. It is the end of the error message.
 
     Raises:

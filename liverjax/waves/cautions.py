@@ -16,7 +16,7 @@ from liverjax.waves.harmonic import relative_moduli
 #: Minimum number of element edges per wavelength of a shear wave. With fewer edges, even quadratic elements cannot
 #: describe a wave.
 _LEAST_PER_WAVE = 2.0
-#: The elements of a part have wavelengths that differ by less than this (logarithm).
+#: In a part of the body with about equal wavelengths, the logarithms of the wavelengths differ by at most this value.
 _ALIKE = 0.3
 
 
@@ -58,17 +58,17 @@ def cautions_of_waves(scene: Scene, about: jax.Array | None = None) -> list[str]
 def _of_short_waves(scene: Scene, hertz: np.ndarray) -> list[str]:
     """Return a warning if the shear waves at one of the frequencies (F,) [Hz] are too short for the elements.
 
-    The parts of the body with waves of about the same length are checked separately (`_ALIKE`). The sizes in the
-    warning are those of the part with the fewest edges per wavelength.
+    Each part of the body with waves of about the same length (`_ALIKE`) is checked separately. The sizes in the warning
+    are those of the part with the fewest edges per wavelength.
     """
     if scene.body is None:
         return []
     own = by_element(scene)
     try:
         moduli = np.asarray(own.law.shear_modulus(), float)
-    except InputError:  # a law may have no moduli
+    except InputError:  # this law defines no shear modulus
         return []
-    # The lowest modulus of each element, if it has several points.
+    # If an element has several integration points, the lowest modulus counts.
     moduli = np.broadcast_to(np.atleast_2d(moduli).min(axis=0), scene.mesh.number_of_elements)
     corners = np.asarray(scene.mesh.points)[np.asarray(scene.mesh.tetrahedra)]
     edges = np.linalg.norm(corners[:, [0, 0, 0, 1, 1, 2]] - corners[:, [1, 2, 3, 2, 3, 3]], axis=2)

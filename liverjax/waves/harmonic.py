@@ -30,7 +30,7 @@ from liverjax.waves.pressures import AtRest
 from liverjax.waves.rest import under_its_weight, without_history
 
 MASSES = ("consistent", "lumped")
-#: Settings of [solve] with which the equations of static equilibrium are set up.
+#: Settings of [solve] for the equations of static equilibrium.
 _STILL: Content = {
     "kind": "static",
     "frequencies": None,
@@ -98,8 +98,8 @@ def harmonic(
             `simulate`. The stress in this state changes the stiffness; the fluid pressure is 0. Default: the state of
             rest under gravity and pre-tension, from a static run. In a scene without gravity and pre-tension, this run
             is not done and the reference shape is used. If the components of gravity are JAX tracers (inside jit, grad
-            or vmap), the run is always done, so a porous body must then be able to drain. `AtRest` also contains the
-            stress of mixed elements.
+            or vmap), the run is always done, so a porous body must then be able to drain. An `AtRest` may replace the
+            positions: it also contains the stress of mixed elements.
         motion: complex amplitudes (V, 3) or (F, V, 3) [m] that replace the prescribed motion of the scene.
         mass: "consistent" (mass matrix of each element), or "lumped". `[body] mass` has no effect.
 
@@ -107,8 +107,8 @@ def harmonic(
         `Harmonic`. The result is NaN at a frequency with a singular matrix.
 
     Raises:
-        InputError: the scene contains what harmonic motion cannot have (for example a pressure that follows the
-            surface, friction, or a rigid plate); wrong shapes or values; too little memory; no state of rest.
+        InputError: the scene contains something that harmonic motion cannot have (for example a pressure that follows
+            the surface, friction, or a rigid plate); wrong shapes or values; too little memory; no state of rest.
     """
     weighed = scene
     omegas = 2 * jnp.pi * _frequencies(scene.solve.frequencies if frequencies_Hz is None else frequencies_Hz)
@@ -152,7 +152,7 @@ def _at_rest(scene: Scene) -> jax.Array | None:
 
 
 def _amplitudes_of_motion(scene: Scene) -> jax.Array:
-    """Return the amplitudes (V, 3) [m] of the prescribed motions. Raise InputError if one has only a history."""
+    """Return the amplitudes (V, 3) [m] of the prescribed motions. Raise InputError if a motion has only a history."""
     for k, moved in enumerate(scene.displaced):
         if moved.by is None:
             raise InputError(f"displaced.{k} has a history but no amplitude: give by, or the argument 'motion'")
@@ -160,7 +160,7 @@ def _amplitudes_of_motion(scene: Scene) -> jax.Array:
 
 
 def _check_about(scene: Scene, about: jax.Array | AtRest | None) -> None:
-    """Raise InputError if the positions `about` have a wrong shape, or do not determine the pressure of a fluid."""
+    """Raise InputError if `about` has a wrong shape, or is given for a porous body that cannot drain."""
     if about is None:
         return
     if scene.porosity is not None and not _drains(scene.porosity):
@@ -277,7 +277,7 @@ def relative_moduli(scene: Scene, omegas: jax.Array) -> jax.Array:
 
 
 def _drains(porosity: Porosity) -> bool:
-    """Return whether fluid can leave the porous body: whether the pressure is given at some nodes."""
+    """Return whether fluid can leave the porous body, because the pressure is given at some nodes."""
     return porosity.drained is not None or any(inlet.nodes is not None for inlet in porosity.inlet)
 
 
@@ -326,8 +326,8 @@ def refuse_not_harmonic(scene: Scene) -> None:
 
 
 def _small(scene: Scene, mass: str) -> Scene:
-    """Return the scene without time and gravity. Raise InputError if it contains something that is not implemented for
-    harmonic motion."""
+    """Return the scene without histories, time steps and gravity. Raise InputError if it contains something that is not
+    implemented for harmonic motion."""
     if mass not in MASSES:
         raise InputError(f"mass = {mass!r} is not known: use {' or '.join(MASSES)}")
     _check_memory(scene.mesh)

@@ -56,14 +56,14 @@ def harmonic_errors(
 ) -> HarmonicError:
     """Estimate the errors of the amplitudes that are due to the mesh.
 
-    Linear elements are replaced by quadratic ones, and quadratic elements by cubic ones. The new problem has about
-    eight times (linear elements) or three times (quadratic elements) as many unknowns, and costs correspondingly more.
-    If there are too few elements per wavelength, the phase of the motion is wrong, and the error is as large as the
+    Linear elements are replaced by quadratic elements, and quadratic elements by cubic elements. The new problem has
+    about eight times (linear elements) or three times (quadratic elements) as many unknowns, so it takes longer. If
+    there are too few elements per wavelength, the phase of the motion is wrong, and the error is as large as the
     motion. The pressures of a fluid are linear in all elements. So a scene with a fluid is solved again, if possible,
     on a mesh where every element is divided into eight. Then the estimated error is 4/3 of the change of the result.
 
     Args:
-        scene, factors, about, motion: the arguments with which `harmonic` was called.
+        scene, factors, about, motion: the arguments of the call of `harmonic`.
         found: the result of `harmonic`.
 
     Raises:
@@ -102,8 +102,8 @@ def harmonic_errors(
 def _richer_elements(scene: Scene) -> Scene:
     rich = enriched(scene)
     if rich.mesh.order == 3:
-        # Cubic elements do not lock. If the pressures of quadratic elements are unknowns, they stay unknowns. The
-        # estimate would otherwise contain the different treatment of the volume, and be a third too small.
+        # Cubic elements do not lock. If the pressures of quadratic elements are unknowns, they stay unknowns. Otherwise
+        # the estimate would also contain the effect of another volumetric formulation, and be a third too small.
         volumetric = "mixed" if form_of_volumes(scene) == "mixed" else "element"
         return replace(rich, solve=replace(rich.solve, volumetric=volumetric))
     if scene.solve.volumetric == "nodal":
@@ -113,11 +113,11 @@ def _richer_elements(scene: Scene) -> Scene:
 
 
 def _with_own_stress(scene: Scene, about: jax.Array, of_all_nodes: jax.Array) -> jax.Array | AtRest:
-    """Return the state of rest of the richer elements: positions of all their nodes, and the stress of the given
-    elements.
+    """Return the state of rest for the richer elements: the positions of all their nodes and, if the elements of the
+    scene are mixed and linear, also the stress of these elements.
 
-    At the same positions, the pressures of mixed quadratic elements would not be those of mixed linear elements, which
-    have a stabilisation term.
+    At the same positions, mixed quadratic elements would have other pressures, because only mixed linear elements have
+    a stabilisation term.
     """
     if scene.mesh.order > 1 or scene.porosity is not None or form_of_volumes(scene) != "mixed":
         return of_all_nodes

@@ -10,7 +10,7 @@ the instantaneous modulus. The tangent consists of a material and a geometric pa
 
 with the tangent K_h of the elastic stress S_h and the geometric part K_geometric of K_h. K_rest is the stiffness that
 does not relax: the stiffness of a porous body, supports, membranes and springs, and of the volumetric part of the law
-if only the isochoric part relaxes. Unknown pressures are treated in `liverjax.waves.pressures`.
+if only the isochoric part relaxes. For unknown pressures, see `liverjax.waves.pressures`.
 """
 
 from typing import NamedTuple
@@ -203,6 +203,6 @@ def _of_nodes_alone(A: Operator, omega: Number, u: jax.Array) -> jax.Array:
 
 
 def free_part(A: Operator, motion: Motion) -> Motion:
-    """Return the components of a motion, or of forces, in the directions in which the nodes are free to move."""
+    """Return a motion, or forces, projected onto the free directions of the nodes and the unknown pressures."""
     u, p = motion
     return A.free.vectors(u), None if A.pressures is None or p is None else A.pressures.mask * p

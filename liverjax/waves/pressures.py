@@ -51,7 +51,7 @@ class Pressures(NamedTuple):
 class AtRest(NamedTuple):
     """Positions at rest with the volumetric stress of mixed elements.
 
-    Linear elements have a stabilisation term, so other elements do not have this stress at the same positions.
+    Only linear elements have a stabilisation term, so other elements have another stress at the same positions.
     """
 
     positions: jax.Array  # (V, 3) [m]
@@ -124,7 +124,7 @@ def _mixed_volume(scene: Scene, x: jax.Array, J: jax.Array) -> Mixed:
 
 
 def _beside_pressures(mesh: TetMesh, volume: Mixed, J: jax.Array) -> jax.Array:
-    """Return the means (P,) [Pa], around the vertices, of the volumetric stress that is not in the pressures."""
+    """Return the volumetric stress that the pressures do not contain, as means (P,) [Pa] around the vertices."""
     return integrals(mesh, jnp.asarray(volume.part) * strain(volume.kind, J)) / integrals(mesh, jnp.ones_like(J))
 
 
@@ -155,8 +155,8 @@ def _sealed(mesh: TetMesh, pull: jax.Array, store: jax.Array) -> Pressures:
 
 
 def _lumped(mesh: TetMesh, density: jax.Array) -> jax.Array:
-    """Return diagonal element matrices (4, 4, E): integrals of a quantity per volume, times the shape function of each
-    vertex. `density`: values of this quantity at the integration points."""
+    """Return diagonal element matrices (4, 4, E): integrals of a quantity per volume times the linear shape function of
+    each vertex. `density`: values of this quantity at the integration points."""
     if mesh.order == 1:
         share = jnp.broadcast_to(mesh.volumes * density / 4, (4, mesh.number_of_elements))
     else:

@@ -1,4 +1,4 @@
-"""The state of rest under gravity and pre-tension, about which a body in harmonic motion vibrates."""
+"""The state of rest under gravity and pre-tension: a body in harmonic motion vibrates about this state."""
 
 import jax
 import jax.numpy as jnp
@@ -27,8 +27,8 @@ _FOR_LONG = 1e12
 
 
 def under_its_weight(scene: Scene) -> jax.Array | None:
-    """Return the positions (V, 3) [m] at rest under gravity and pre-tension, after all stresses have relaxed. Return
-    None if there is neither gravity nor pre-tension.
+    """Return the positions (V, 3) [m] at rest under gravity and pre-tension, after the relaxation of the viscous
+    stresses. Return None if there is neither gravity nor pre-tension.
 
     Pre-tension is a force that acts already in the reference shape, for example the force of a tight ligament.
     Tractions and inlets cause only the vibration, so they do not act here. Inside jit, grad or vmap, the positions are
@@ -95,7 +95,7 @@ def _is_pulled(still: Scene) -> bool:
     return whether the scene has a ligament that is tight or may be tight."""
     if not still.physics:
         return False
-    # The relaxed law may have no stiffness left (springpots with spring = 0), so the law before relaxation is used.
+    # The relaxed law may have no stiffness (springpots with spring = 0), so the law before relaxation is used.
     law = still.law if still.unrelaxed is None else still.unrelaxed
     alone = replace(still, law=law, unrelaxed=None, fixed=(), displaced=(), body=None, porosity=None)
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((alone, still.fixed))):

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 #: Displacements (F, V, 3) [m] at every frequency, and pressures (F, P) [Pa] or None.
 Motions = Motion
 #: Maximum memory [bytes] of the factors that are kept for derivatives. Factors of other matrices are deleted first. If
-#: the factors of all frequencies need more, they are kept as 16-bit integers, which need half the memory.
+#: the factors of all frequencies need more memory, they are kept as 16-bit integers, with half the memory.
 KEPT = 2e9
 
 _factors: dict[bytes, multifrontal.Factor] = {}
@@ -177,7 +177,7 @@ def _elements_alone(A: Any) -> bool:
 
 
 def _entries_of_free(blocks: "scipy.sparse.csr_array", free: np.ndarray) -> "scipy.sparse.csr_array":
-    """Return a sparse matrix of the free unknowns. Its entries are indices into the entries of all matrix blocks."""
+    """Return a sparse matrix of the free unknowns. Each entry is its index among the entries of all matrix blocks."""
     import scipy.sparse
 
     every = np.arange(9 * blocks.nnz, dtype=np.min_scalar_type(9 * blocks.nnz)).reshape(-1, 3, 3)
@@ -213,8 +213,8 @@ def _matrix(A: Any, order: _Order, factor: np.ndarray, omega: float) -> Any:
 def _blocks_of_nodes(A: Any, order: _Order, factor: np.ndarray, omega: float) -> np.ndarray:
     """Return the complex matrix blocks of pairs of nodes (blocks, 3, 3) [N/m], summed over the elements.
 
-    Sums are computed with real numbers, and no sum is computed twice, because here the allocation of large arrays takes
-    longer than the arithmetic.
+    The sums use real arrays, and each sum is computed once, because the allocation of large arrays takes longer here
+    than the arithmetic.
     """
     number = order.blocks.nnz
 

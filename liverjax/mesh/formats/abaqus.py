@@ -18,8 +18,8 @@ from liverjax.core.errors import InputError
 if TYPE_CHECKING:
     import meshio
 
-#: Pattern of Abaqus' element types -> {number of nodes: meshio's name of the cells}. The pattern finds the number of
-#: nodes in the name of the type. Elements of other types (lines, quadrilaterals, …) are ignored.
+#: Pattern of Abaqus' element types -> {number of nodes: meshio's name of the cells}. The number in parentheses in the
+#: pattern is the number of nodes. Elements of other types (lines, quadrilaterals, …) are ignored.
 _CELLS = {
     r"(?:[AD]?C3D|SC|COH3D)(\d+)[A-Z]*": {
         4: "tetra", 5: "pyramid", 6: "wedge", 8: "hexahedron", 10: "tetra10", 15: "wedge15", 20: "hexahedron20",
@@ -33,7 +33,7 @@ _FACES = {"S1": (0, 2, 1), "S2": (0, 1, 3), "S3": (1, 2, 3), "S4": (0, 3, 2)}
 _MAKING = ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM")
 
 
-#: Place of a set: True if it belongs to the part, and its name in small letters.
+#: Place (key) of a set or surface: (True in the part, False in the assembly; its name in small letters).
 _Place = tuple[bool, str]
 
 
@@ -42,7 +42,7 @@ class _Card(NamedTuple):
     parameters: dict[str, str]  # names in capital letters
     lines: list[list[str]]  # cells of the data lines
     inside: bool = True  # True: the card is in the part, or the file has no parts. False: it is in the assembly.
-    assembly: str = ""  # name of the assembly in small letters; "" if it has none, or the name of the part or instance
+    assembly: str = ""  # name of the assembly in small letters; "" if missing, or also the name of the part or instance
 
 
 class _Block(NamedTuple):
@@ -54,10 +54,10 @@ class _Block(NamedTuple):
 
 
 def read_abaqus(path: Path) -> "meshio.Mesh":
-    """Read an Abaqus input file with one part. The mesh and its sets have the form in which `meshio.read` returns them.
+    """Read an Abaqus input file with one part. The result has the same form as the result of `meshio.read`.
 
-    If the part and the assembly both have a set or surface named SET, that of the part gets the name PART.SET. Nodes of
-    the assembly are reference points, which are ignored.
+    If the part and the assembly both have a set or surface named SET, the set or surface of the part is named PART.SET.
+    Nodes of the assembly are reference points, which are ignored.
 
     Raises:
         InputError: the file cannot be read, has several parts, or creates nodes or elements by keywords such as *NGEN.
@@ -126,7 +126,8 @@ def _cards(path: Path, outer: tuple[Path, ...]) -> Iterator[_Card]:
 
 
 def _is_data(line: str) -> bool:
-    """Return whether a line after a comma is a data line: it begins with a whole number, or has no letters."""
+    """Return whether a line is a data line, although the keyword line before it ends with a comma. A data line begins
+    with a whole number, or has no letters."""
     return re.match(r"\s*\d+\s*,", line) is not None or not re.search("^[*]|=|[A-Za-z]", line)
 
 
@@ -238,10 +239,10 @@ def _cards_of_sets(cards: list[_Card], key: str) -> dict[_Place, list[int]]:
 
 
 def _place_of(name: str, card: _Card, places: Iterable[_Place], kind: str) -> _Place:
-    """Return the place of the set that a card names. `kind`: the kind of the set (set of nodes or of elements), for
-    messages."""
+    """Return the place of the set `name` that a card mentions. `kind`: the kind of the set (set of nodes or of
+    elements), for messages."""
     small = name.lower()
-    before, _, last = small.rpartition(".")  # the name of the part or of the assembly may stand before that of the set
+    before, _, last = small.rpartition(".")  # the name of the part or assembly may stand before the name of the set
     candidates = [(card.inside, small), (True, small), (True, last), (False, small), (False, last)]
     if before and before == card.assembly:
         candidates.insert(0, (False, last))
@@ -277,7 +278,7 @@ def _members(
 
 
 def _sets_by_name(cards: list[_Card], key: str, members: dict[_Place, set[int]]) -> dict[str, set[int]]:
-    """Return {name of a set: numbers of its members}. A name is written as the file first writes it."""
+    """Return {name of a set: numbers of its members}. The first spelling of a name in the file is used."""
     names: dict[str, str] = {}
     for (_, name), own in _cards_of_sets(cards, key).items():
         names.setdefault(name, cards[own[0]].parameters[key])
@@ -285,12 +286,13 @@ def _sets_by_name(cards: list[_Card], key: str, members: dict[_Place, set[int]])
 
 
 def _full_name(cards: list[_Card], at: _Place, names: dict[str, str], places: Iterable[_Place]) -> str:
-    """Return the name of a set or surface, after the name of the part if the assembly has one with the same name.
+    """Return the name of a set or surface. If the part and the assembly both have this name, PART. stands before the
+    name of the part's set or surface.
 
     Args:
         cards: cards of the file.
         at: place of the set or surface.
-        names: {name in small letters: name as the file first writes it}.
+        names: {name in small letters: first spelling of the name in the file}.
         places: places of all sets or surfaces.
     """
     inside, name = at
@@ -359,7 +361,8 @@ def _nodes_of(
 
 
 def _range_of(card: _Card, cells: list[str]) -> set[int]:
-    """Return all numbers of a range. The data line contains the first number, the last number and the step (or 1)."""
+    """Return all numbers of a range. The data line contains the first number, the last number and the step. If the step
+    is missing, it is 1."""
     if not 2 <= len(cells) <= 3 or not all(cell.isdigit() for cell in cells) or cells[2:] == ["0"]:
         raise _Wrong(f"*{card.keyword}, GENERATE has the line {','.join(cells)}; give first, last, step")
     first, last, step = (int(cell) for cell in (*cells, "1")[:3])

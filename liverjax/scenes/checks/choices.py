@@ -29,8 +29,8 @@ def check_choices(scene: Scene) -> None:
     Numbers are not checked. Their values may be unknown inside jit.
 
     Raises:
-        InputError: a choice is unknown, or cannot be combined with another one; a load or a motion is given twice, not
-            at all or in a wrong shape.
+        InputError: a choice is unknown, or cannot be combined with another choice; a load or a motion is given twice,
+            not at all or in a wrong shape.
     """
     check_kinds(scene)
     for key, allowed in CHOICES.items():

@@ -62,8 +62,8 @@ def check_plates_alone(scene: Scene) -> None:
 def check_normals(scene: Scene) -> None:
     """Raise InputError if a node slides in two planes that are not normal to x, y or z (oblique planes).
 
-    An error is also raised if a node slides in an oblique plane and is fixed along some, but not all, of the axes along
-    which the normal of this plane has a component. Arrays inside jit, grad or vmap are not checked.
+    An error is also raised if a node slides in an oblique plane, and the plane's normal has components along both a
+    constrained and a free axis of this node. Arrays inside jit, grad or vmap are not checked.
     """
     slides = [(name, physics) for name, physics in named_physics(scene) if isinstance(physics, SlidingSupport)]
     nodes = [*(f.nodes for f in scene.fixed), *(d.nodes for d in scene.displaced), *(s.nodes for _, s in slides)]

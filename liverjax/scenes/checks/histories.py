@@ -1,4 +1,4 @@
-"""Find histories of loads and motions that a run does not follow: they have peaks between two steps, or begin late."""
+"""Find histories of loads and motions that the steps of a run do not resolve, or that begin after its end."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ def cautions_of_histories(scene: Scene, ends: np.ndarray) -> list[str]:
 
     Args:
         scene: `Scene` with known numbers (not inside jit, grad or vmap).
-        ends: times (T,) [s] at which the steps end.
+        ends: end times (T,) [s] of the steps.
     """
     said = []
     steps = np.concatenate([[0.0], ends])

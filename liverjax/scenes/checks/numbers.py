@@ -55,9 +55,9 @@ def check_numbers(scene: Scene, changed: Collection[str] | None = None) -> None:
 
     Args:
         scene: `Scene`.
-        changed: dotted names of the numbers that differ from those of a checked scene, for example ``law.mu``. The
-            elements of regions are then not checked again, and the shear modulus only if a law may have changed. If
-            None, everything is checked.
+        changed: dotted names of the numbers that changed since the last check, for example ``law.mu``. The elements of
+            regions are then not checked again, and the shear modulus only if a law may have changed. If None,
+            everything is checked.
 
     Raises:
         InputError: a number is out of bounds, numbers of law, viscosity or porosity contradict each other, the shear
@@ -82,7 +82,8 @@ def _check_stiffness(scene: Scene) -> None:
     """Raise InputError if the shear modulus at rest of the whole law is negative in an element.
 
     One law of a sum may have a negative shear modulus. A law without the method `shear_modulus` is not checked, and
-    neither is a law inside jit, grad or vmap. The message names a region if the modulus is not negative without it.
+    neither is a law inside jit, grad or vmap. The message names a region if the modulus is not negative without this
+    region.
     """
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((scene.law, scene.region))):
         return
@@ -103,6 +104,6 @@ def _least_shear_modulus(scene: Scene, regions: tuple[Region, ...]) -> float:
     method `shear_modulus`."""
     whole, least = law_of_elements(scene.law, regions, scene.mesh.number_of_elements), np.inf
     for k in range(len(whole.pieces())):
-        with suppress(InputError):  # a law may have no moduli
+        with suppress(InputError):  # this law defines no shear modulus
             least = np.fmin.reduce(np.ravel(np.asarray(whole.piece(k).shear_modulus(), float)), initial=least)
     return float(least)

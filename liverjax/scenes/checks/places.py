@@ -76,9 +76,9 @@ def _has_vertices(mesh: TetMesh, nodes: object, name: str) -> None:
 
 
 def _inlets_that_act(sponge: Porosity) -> None:
-    """Raise InputError if an inlet has no effect, because other pressures are given at all of its nodes.
+    """Raise InputError if an inlet or the drained region has no effect, as other pressures are given at all its nodes.
 
-    Inlets may have some nodes in common with other inlets or with the drained nodes: the later inlet counts there.
+    Inlets may have some common nodes. There, the later inlet counts. Drained nodes count only where there is no inlet.
     """
     pressures = {k: set(np.asarray(own.nodes).tolist()) for k, own in enumerate(sponge.inlet) if own.nodes is not None}
     for k, own in pressures.items():

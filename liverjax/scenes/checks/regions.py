@@ -189,7 +189,7 @@ def _check_limits(scene: Scene) -> None:
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((values, changed, places))):
         return
     if any(np.shape(value) not in ((), (1,), (n,)) for value in values.values()):
-        return  # a wrong number of values
+        return  # other shapes are not compared here
     for key in keys:
         numbers = np.broadcast_to(np.asarray(values[key], float), (n,)).copy()
         for k, own in changed.items():

@@ -45,7 +45,7 @@ def check_held(scene: Scene) -> None:
         split = (
             f"merge the {doubled} nodes that coincide with another node (if the mesh should be connected there), or "
         )
-        static = scene.solve.kind == "static"  # otherwise the state without loads is sought, which is static too
+        static = scene.solve.kind == "static"  # otherwise the mesh is the loaded body
         or_motion = " or kind = 'dynamic'" if static else ""
         remedy = f"{split if doubled else ''}add [[fixed]]{or_motion}"
         raise InputError(f"the supports do not prevent every rigid motion of {loose}: {remedy}")
@@ -79,11 +79,11 @@ def loose_piece(scene: Scene, holds: Callable[[Physics], tuple[np.ndarray, np.nd
 
 
 def _rigid_motions(numbers: np.ndarray, directions: np.ndarray, arms: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """Return the six rigid motions of a piece, projected on the n constraints (n, 6) that concern only this piece.
+    """Return the components (n, 6) of the six rigid motions of a piece along the n constraints of this piece alone.
 
     Args:
         numbers: node numbers (N,) or (N, m) of all constraints.
-        directions: directions (N, 3) or (N, m, 3) of these nodes.
+        directions: constrained directions (N, 3) or (N, m, 3) of these nodes.
         arms: positions (V, 3) of all nodes from the middle of the piece, divided by its size.
         inside: whether a node belongs to the piece (V,).
     """
