@@ -39,12 +39,15 @@ def check_fields(thing: Any, name: str = "", leave: tuple[str, ...] = ()) -> Non
 
 
 def _fields(thing: Any, name: str, leave: tuple[str, ...]) -> Iterator[tuple[str, Mapping, object]]:
-    """Yield (dotted name, metadata, value) of every field with metadata, also in nested structs, but not of `leave`."""
+    """Yield (dotted name, metadata, value) of every field with metadata, also in nested structs.
+
+    Fields of `thing` whose names are in `leave` are omitted.
+    """
     for field in dataclasses.fields(thing):
         value = getattr(thing, field.name)
         if value is None or field.name in leave or (isinstance(value, dict) and field.name in _DICTIONARIES):
             continue
-        # The names are the names in scene files: `law.0.mu`, not `law.laws.0.mu`.
+        # These names are the same as in scene files: `law.0.mu`, not `law.laws.0.mu`.
         dotted = name if field.metadata.get("unnamed") else ".".join(filter(None, (name, field.name)))
         several = isinstance(value, tuple) and any(dataclasses.is_dataclass(v) for v in value)
         if dataclasses.is_dataclass(value):
@@ -91,7 +94,7 @@ def check_bound(where: str, metadata: Mapping, value: object) -> None:
         numbers = _numbers_of(where, metadata, value, leaves)
         if not numbers.size:
             return
-        least, most = numbers.min(), numbers.max()  # both are NaN if one number is NaN
+        least, most = numbers.min(), numbers.max()  # minimum and maximum are NaN if one number is NaN
     above, upper = metadata.get("above"), metadata.get("upper")
     inside = (above is None or least > above) and (lower is None or least >= lower) and (upper is None or most <= upper)
     if not (inside and math.isfinite(least) and math.isfinite(most)) or metadata.get("nonzero"):
@@ -160,15 +163,15 @@ def check_shape(where: str, value: Any, *allowed: tuple[int, ...]) -> None:
 
 
 def shape_of(value: Any) -> tuple[int, ...]:
-    """Return the shape of a value. NumPy cannot determine the shape of a sequence of numbers inside jit."""
+    """Return the shape of a value, also of a sequence of numbers inside jit (NumPy cannot determine this shape)."""
     rows = {shape_of(row) for row in value} if isinstance(value, tuple | list) else set()
     return (len(value), *rows.pop()) if len(rows) == 1 else np.shape(value)
 
 
 def finite(value: float) -> bool:
-    """Return whether a number is finite as a float.
+    """Return whether a number can be converted to a finite float.
 
-    A whole number with hundreds of digits is not finite in this sense, because it is too large for a float.
+    The result is False for a whole number with hundreds of digits, because this number is too large for a float.
     """
     try:
         return math.isfinite(value)

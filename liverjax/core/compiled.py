@@ -52,8 +52,8 @@ def compiled(function: Callable[..., Any], *arguments: Any, short: bool = False)
             the partial become constants of the program.
         arguments: pytrees of arrays and numbers. If they contain structs that a user has defined, the program is not
             stored on disk.
-        short: whether the program runs for a second or less. Then a short compilation is more important than a short
-            run.
+        short: whether the program runs for a second or less. If true, a short compilation is more important than a
+            short run.
     """
     folder, options = program_cache.folder(), _QUICK if short and jax.default_backend() == "cpu" else {}
     if folder is None or jax.default_backend() != "cpu":  # programs for other devices are only in JAX's cache

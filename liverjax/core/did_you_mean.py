@@ -1,4 +1,4 @@
-"""Check words that users have written, and give the end of a message about an unknown word."""
+"""Check words that users have written, and make the hint in a message about an unknown word."""
 
 import difflib
 from collections.abc import Iterable
@@ -7,10 +7,10 @@ from liverjax.core.errors import InputError
 
 
 def hint(word: str, known: Iterable[str], before: str = "") -> str:
-    """Return the end of a message about an unknown word.
+    """Return the hint for a message about an unknown word. The hint is the end of the message.
 
-    This end contains the known word that is most similar, or all known words if none is similar. `before` is written
-    before each known word, for example "law.".
+    It contains the most similar known word, or all known words if none is similar. `before` is written before each
+    known word, for example "law.".
     """
     words = list(known)
     longer = [name for name in words if len(word) > 2 and name.startswith(word)]

@@ -50,7 +50,7 @@ def writable(out: Path, files: tuple[str, ...], folders: tuple[str, ...] = (), i
         raise InputError(f"--out {out} cannot be used ({error.strerror}): name a folder that can be written") from None
 
 
-#: Age [s] after which a temporary file must be from a killed process.
+#: Age [s] above which a temporary file is assumed to be from a killed process.
 OLD = 86400.0
 
 

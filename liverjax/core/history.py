@@ -137,8 +137,8 @@ def value_at(value: object, time: Number, times: Any, history: Any) -> Any:
 def integral_of(value: Number, begin: Number, dt: Number, times: Numbers, history: Numbers) -> jax.Array:
     """Return the time integral of `value` times the factor of its history, from `begin` to `begin` + dt [s].
 
-    Each line between two times of the history is integrated alone, so that derivatives are also right if a step ends at
-    one of these times.
+    The intervals between two times of the history are integrated separately. So derivatives are also correct if a step
+    ends at one of these times.
     """
     t, factors = jnp.asarray(times) - begin, jnp.asarray(history)
     inside = jnp.clip(t, 0.0, dt)

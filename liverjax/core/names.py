@@ -111,14 +111,14 @@ def _names_of_numbers(struct: object, before: str = "") -> Iterator[str]:
 
 
 def _keys(thing: Any, path: list[str], refusal: str, before: str) -> tuple[list, list[str]]:
-    """Return the keys of `thing` for the first words of a path, and the remaining words of the path.
+    """Return the keys that the first words of a path select in `thing`, and the remaining words of the path.
 
     `before` is the beginning of the dotted name, without the path. It is used in messages.
     """
     word, rest = path[0], path[1:]
     if dataclasses.is_dataclass(thing):
         return _keys_of_struct(thing, path, refusal, before)
-    if isinstance(thing, dict):  # a key may contain dots; an index into its array may follow the key
+    if isinstance(thing, dict):  # a key may contain dots; an index of the array at this key may follow
         ends = (n for n in range(len(path), 0, -1) if ".".join(path[:n]) in thing)
         if end := next(ends, 0):
             return [".".join(path[:end])], path[end:]
@@ -155,7 +155,10 @@ def _is_whole(value: object) -> bool:
 
 
 def _is_place(word: str) -> bool:
-    """Return whether a word is an index, such as 2. A word like 02 is not an index, so that each index has one name."""
+    """Return whether a word is an index, such as 2.
+
+    The word 02 is not an index, so that each value has only one name.
+    """
     return word.isascii() and word.isdigit() and str(int(word)) == word
 
 

@@ -30,15 +30,15 @@ def static(
 ) -> Any:
     """Declare a field that is part of the structure of a pytree, for example a tag or a count.
 
-    The field has no gradient, and a new value needs a new compilation. With `lower`, the value must be a whole number,
-    `lower` or more. With `words`, the value must be one of these words (see `liverjax.core.bounds`).
+    The field has no gradient, and a new value needs a new compilation. With `lower`, the value must be a whole number
+    that is at least `lower`. With `words`, the value must be one of these words (see `liverjax.core.bounds`).
     """
     metadata = {"static": True, "about": about, "lower": lower, "words": tuple(words)}
     return dataclasses.field(default=default, metadata=metadata)
 
 
 class Limits(TypedDict, total=False):
-    """Bounds of a number that `liverjax.core.bounds.check_fields` checks."""
+    """Bounds of a number. The function `liverjax.core.bounds.check_fields` checks these bounds."""
 
     lower: float  # inclusive
     upper: float  # inclusive
@@ -60,7 +60,7 @@ def param(
     Args:
         unit: SI unit, ``"1"`` for a pure number. `liverjax.laws.scaled` multiplies all fields in ``Pa``, so a law
             must not have another unit of pressure.
-        about: one line for ``python -m liverjax laws``.
+        about: one-line description that ``python -m liverjax laws`` prints.
         each: whether the value is a sequence: one number for each term of a law, or the components of a direction.
             The struct keeps an array (n,) as a tuple; `jnp.stack` makes it an array again.
         typical: value for a soft tissue with a shear modulus of about 1 kPa. It is used if a user gives only the name
@@ -83,7 +83,7 @@ def param(
 
 
 def unnamed(about: str = "", *, places: str = "", default: object = dataclasses.MISSING) -> Any:
-    """Declare a field that contains structs. Dotted names do not contain its name: `law.mu`, not `law.law.mu`.
+    """Declare a field that contains structs. Dotted names omit the name of this field: `law.mu`, not `law.law.mu`.
 
     Args:
         about: one line about the field.

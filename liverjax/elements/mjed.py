@@ -6,12 +6,12 @@ second derivatives of the energy density W with respect to I_a and I_b, summed o
     f_i  = V0 sum_a W_a v_a,i                                             v_a,i = dI_a/dx_i
     K_ij = V0 [ sum_ab W_ab v_a,i (x) v_b,j + sum_a W_a d2I_a/dx_i dx_j ]
 
-V0 is the reference volume of the element, x_i is the position of node i, and (x) is the tensor product. The cost does
-not grow with the number of terms g^k(I1, I2) h^k(J) of W. No matrix is inverted. In all functions the force is the
-gradient of the energy, f = + dW/dx; the nodal force in the chapter is -dW/dx.
+V0 is the reference volume of the element, x_i is the position of node i, and (x) is the tensor product. The computing
+time does not grow with the number of terms g^k(I1, I2) h^k(J) of W. No matrix is inverted. In all functions the force
+is the gradient of the energy, f = + dW/dx; the nodal force in the chapter is -dW/dx.
 
-A linear element has one integration point. At each point of a quadratic element the formulas are the same, with the
-corners that `liverjax.mesh.shape_functions` describes.
+A linear element has one integration point. At each integration point of a quadratic element, the same formulas hold if
+the corners are replaced by the four points y_k of `liverjax.mesh.shape_functions`.
 """
 
 from functools import partial
@@ -61,7 +61,7 @@ def internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
 
     Args:
         mesh: `TetMesh`.
-        law: any law. Derivatives with respect to its parameters are possible.
+        law: any law. The result can be differentiated with respect to the parameters of the law.
         x: positions (V, 3) [m].
     """
     return nodal_force(mesh, first_piola(mesh.at_points(law), deformation_gradient(mesh, x)))
@@ -70,7 +70,8 @@ def internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
 def linear_force(mesh: TetMesh, law: Law, motion: jax.Array) -> jax.Array:
     """Return the derivative (V, 3) [N] of `internal_force` at the reference shape, along a motion (V, 3) [m].
 
-    The deformation gradient and the sum at nodes are linear, so only the stress has to be differentiated.
+    The deformation gradient is linear in the motion, and the nodal forces are linear in the stress. So only the stress
+    has to be differentiated.
     """
     law, dF = mesh.at_points(law), deformation_gradient(mesh, motion)
     rest = tuple(tuple(jnp.full_like(dF[i][j], i == j) for j in range(3)) for i in range(3))
@@ -159,7 +160,7 @@ def of_nodes(order: int, corners: jax.Array) -> jax.Array:
 def sparse(mesh: TetMesh, entries: np.ndarray) -> "scipy.sparse.csr_array":
     """Assemble matrices (E, 9 n^2) of elements with n nodes into a matrix (3V, 3V). Row: 3 * node + component.
 
-    Rows and columns of functions of order 3 get the signs of these functions (`TetMesh.oriented`).
+    In elements of order 3, rows and columns are multiplied by the signs of the shape functions (`TetMesh.oriented`).
     """
     import scipy.sparse  # imported here, since it takes a fifth of the package's import time
 
@@ -180,8 +181,8 @@ def stiffness_matrix(
 
     Args:
         mesh, law, x: the same arguments as for `internal_force`.
-        regularised: whether to use the regularisation of section 4.1.2 iii of the book chapter, modified such that it
-            does not change the trace. It changes the path of Newton's iterations, but not their solution.
+        regularised: whether to use the regularisation of section 4.1.2 iii of the book chapter, modified such that the
+            trace of the matrix does not change. It changes the path of Newton's iterations, but not their solution.
         terms: "contracted", or "chapter" for the six terms per product g(I1, I2) h(J) of the chapter. Both give
             the same matrix up to roundoff.
     """

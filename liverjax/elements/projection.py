@@ -4,12 +4,12 @@ Let F = U diag(s) V^T. In the axes of U and V, the second derivative of an isotr
 3 x 3 matrix for the three stretches, and one 2 x 2 matrix [[a, b], [b, a]] for each pair of axes. The eigenvalues of
 the 2 x 2 matrix are a - b (twist) and a + b (flip) (Smith, De Goes, Kim 2019, Analytic eigensystems for isotropic
 distortion energies). Negative eigenvalues are replaced by their absolute values (Chen et al. 2024). Then the blocks are
-rotated back.
+rotated back to the coordinate axes.
 
-The terms of fibres, of Green's strain and of the history variables of viscosity have other axes. For Green's strain and
-viscosity, the geometric stiffness uses the stress S, with its eigenvalues replaced by their absolute values. The
-negative part of the stiffness of a fibre is omitted. Then no term has a negative eigenvalue, and their sum has none
-either.
+The terms of fibres, of Green's strain and of the history variables of viscosity have other axes than U and V. For
+Green's strain and viscosity, the geometric stiffness uses the stress S, with its eigenvalues replaced by their absolute
+values. The negative part of the stiffness of a fibre is omitted. Then no term has a negative eigenvalue, so the sum of
+the terms has no negative eigenvalue either.
 """
 
 from typing import Any, NamedTuple
@@ -44,7 +44,10 @@ _PAIRS = ((0, 1), (0, 2), (1, 2))
 
 
 class Frame(NamedTuple):
-    """Decomposition F = U diag(s) V^T with rotations U and V. The last s is the smallest; it is < 0 if det F < 0."""
+    """Decomposition F = U diag(s) V^T with rotations U and V.
+
+    The last singular value s is the smallest. It is negative if det F < 0.
+    """
 
     U: Matrix
     s: Vector
@@ -54,7 +57,7 @@ class Frame(NamedTuple):
 def frame(F: Matrix) -> Frame:
     """Return the signed singular values of a tuple matrix F (the largest first) and their axes.
 
-    The axes of singular values 0 are arbitrary.
+    If a singular value is 0, its axes are arbitrary.
     """
     _, axes = principal(F)
     n = list(transpose(axes))
@@ -92,7 +95,7 @@ def blocks(
     pairs: tuple[tuple[int, int], ...],
     volume: Scalars | None = None,
 ) -> list[Matrix]:
-    """Return stiffness blocks like `invariant_terms.blocks`, such that the element matrix has no negative eigenvalue.
+    """Return the blocks of `invariant_terms.blocks`, changed such that the element matrix has no negative eigenvalue.
 
     Args:
         parts: pairs (weight, law). The energy is the weighted sum of the energies of the laws.

@@ -120,7 +120,7 @@ def _with_signs(mesh: TetMesh, values: jax.Array) -> jax.Array:
 
 
 def _energy_of_C(law: Law, C: jax.Array) -> jax.Array:
-    """Return the energy W as a function of C, at the transposed Cholesky factor F of C (F^T F = C, J > 0)."""
+    """Return the energy W as a function of C. It is evaluated at F, the transposed Cholesky factor of C."""
     return law.energy(jnp.swapaxes(jnp.linalg.cholesky(0.5 * (C + jnp.swapaxes(C, -1, -2))), -1, -2))
 
 

@@ -55,7 +55,10 @@ class Law(Energies):
         raise InputError(f"law {type(self).__name__} has no ground-state shear modulus: define shear_modulus(self)")
 
     def bulk_modulus(self) -> Any:
-        """Return the ground-state bulk modulus `bulk` [Pa]. Raise `InputError` if other energies may contribute."""
+        """Return the ground-state bulk modulus `bulk` [Pa].
+
+        Raise `InputError` if energies other than U(J) may contribute to the modulus.
+        """
         if type(self).strain_energy is not Energies.strain_energy or self.green_energy is not None:
             raise InputError(f"law {type(self).__name__} has no ground-state bulk modulus: define bulk_modulus(self)")
         return 0.0 if self.bulk is None else self.bulk
@@ -74,7 +77,7 @@ class Law(Energies):
     # -- parts of a law -----------------------------------------------------------------------------------------------
 
     def each(self, change: Callable[["Law"], "Law"]) -> "Law":
-        """Return `change(law)`. If the body has laws of several kinds, `change` is applied to each of them."""
+        """Return `change(law)`. If the body has laws of several kinds, `change` is applied to each law."""
         return change(self)
 
     def isochoric_part(self) -> Any:
@@ -119,7 +122,7 @@ class Law(Energies):
         """
         A = invariant_terms.tangent(invariant_terms.state(self, unpack(_floating(F))))
         rows = [[jnp.stack([pack(A[J][L]) for L in range(3)], axis=-1)] for J in range(3)]
-        # `pack` returns arrays (..., i, k). L is stacked as the last axis, and then J before k: (..., i, J, k, L).
+        # `pack` returns (..., i, k). L is stacked as the last axis. Then J is stacked before k: (..., i, J, k, L).
         return jnp.stack([r[0] for r in rows], axis=-3)
 
     def __add__(self, other: "Law") -> "Sum":
@@ -148,7 +151,7 @@ def _floating(F: Number) -> jax.Array:
 class Sum(Law):
     """Several laws acting in parallel. The energy is the sum of their energies.
 
-    A sum among `laws` is replaced by its laws, so no law of a `Sum` is a `Sum`.
+    If one of the `laws` is a sum, the laws of this sum replace it. So no law of a `Sum` is a `Sum`.
     """
 
     laws: tuple = unnamed("laws whose energies are added")
@@ -175,7 +178,7 @@ class Sum(Law):
         return _added([part for part in (law.volumetric_part() for law in self.laws) if part is not None])
 
     def without_volume(self):
-        """Return the sum of the laws without their volumetric energies. Returns None if no law has another energy."""
+        """Return the sum of the laws without their volumetric energies. Returns None if no other energy is left."""
         return _added([part for part in (law.without_volume() for law in self.laws) if part is not None])
 
     def check(self):

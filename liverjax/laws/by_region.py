@@ -47,7 +47,10 @@ class ByRegion(Law):
         return self.each(lambda law: law.isochoric_part())
 
     def volumetric_part(self) -> Any:
-        """Return the volumetric parts of all laws; K = 0 for a law without this part. Returns None if no law has it."""
+        """Return the volumetric parts of all laws, with K = 0 for a law without this part.
+
+        Returns None if no law has a volumetric part.
+        """
         if all(law.volumetric_part() is None for law in self.laws):
             return None
         return self.each(lambda law: law.volumetric_part() or Volumetric(bulk=0.0))

@@ -14,8 +14,8 @@ class Continued(Law):
     """A law of I1, I2 and J that is unchanged above J = c. Energy and stress are continuous at J = c.
 
     Below c, the energy is evaluated at c^2/(2c - J) instead of J. This value is positive, so the isochoric invariants
-    exist. A separate volumetric energy U(J) is instead replaced by its second-order Taylor series at c. The energy
-    increases while an element is flattened and inverted.
+    exist. This does not apply to a separate volumetric energy U(J): below c, its second-order Taylor series at c
+    replaces U(J). The energy increases while an element is flattened and inverted.
     """
 
     law: Law = unnamed("the law that is continued")
@@ -27,7 +27,7 @@ class Continued(Law):
         return self.law.invariants if "J" in self.law.invariants else (*self.law.invariants, "J")
 
     def isochoric_part(self) -> Law | None:
-        """Return the law without its volumetric energy. Returns None if the energy cannot be split."""
+        """Return the continued law without its volumetric energy. Returns None if the energy cannot be split."""
         part = self.law.isochoric_part()
         return None if part is None else Continued(law=part, below=self.below)
 
@@ -42,7 +42,7 @@ class Continued(Law):
         return self if part is self.law else None if part is None else Continued(law=part, below=self.below)
 
     def measures(self, F):
-        """Return the invariants of the original law with J replaced, and J itself."""
+        """Return the invariants of the original law, with the value of `_replaced` instead of J, and the true J."""
         J = determinant(F)
         return self._whole().measures(F)._replace(J=self._replaced(J)[0]), J
 
@@ -83,7 +83,7 @@ class Continued(Law):
         return self.law if part is None else part
 
     def _replaced(self, J: Number) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return the replaced J (c^2/(2c - J) below c, J above c), and its first and second derivative."""
+        """Return the replaced J (c^2/(2c - J) below c, J above c), and its first two derivatives with respect to J."""
         c, lower = self.below, self.below > J
         inverse = 1 / (2 * c - jnp.minimum(J, c))
         squared = c * c * inverse * inverse
@@ -95,11 +95,11 @@ class Continued(Law):
 
 
 def continued(law: Law, below: float) -> Law:
-    """Return the law with an energy that is defined for every J in exact arithmetic (see `Continued`).
+    """Return the law, changed such that its energy is defined for every J in exact arithmetic (see `Continued`).
 
-    Above J = `below` it is the same law. Below c, the isochoric invariants grow while J decreases. So an exponential of
-    them can exceed the largest floating-point number, for example in float32 at J = -1. Energy and forces are then
-    infinite or NaN.
+    Above J = c (argument `below`) it is the same law. Below c, the isochoric invariants grow while J decreases. So an
+    exponential of them can exceed the largest floating-point number, for example in float32 at J = -1. Energy and
+    forces are then infinite or NaN.
 
     Args:
         law: a law of I1, I2 and J, or a sum of such laws.

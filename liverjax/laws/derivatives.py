@@ -10,7 +10,7 @@ from liverjax.tensors.matrices import Invariants
 First = dict[str, Any]
 Second = dict[tuple[str, str], Any]
 
-#: Scalar invariants. Keys of second derivatives are pairs in this order.
+#: Names of the scalar invariants. A key of the second derivatives is a pair of names in this order.
 ORDER = ("I1", "I2", "I4", "J")
 
 

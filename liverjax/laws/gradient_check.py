@@ -42,7 +42,9 @@ class Check(NamedTuple):
 
 
 def load(name: str) -> Law:
-    """Return an included law by its name, or the law FILE.py:LAW of a Python file. A class gets typical values.
+    """Return an included law by its name, or the law LAW of a Python file by the name FILE.py:LAW.
+
+    If LAW is a class, its parameters get their typical values.
 
     Raises:
         InputError: the law or file does not exist or does not work, or a parameter has no typical value.
@@ -52,7 +54,8 @@ def load(name: str) -> Law:
     file, _, attribute = name.rpartition(":") if ":" in name else (name, "", "")
     if not Path(file).is_file():
         raise InputError(f"{file} is not a file: give FILE.py:LAW with the path of a Python file")
-    # `dataclasses` needs the module in `sys.modules`. Its name there differs from the file name, which may be jax.py.
+    # `dataclasses` needs the module in `sys.modules`. The name of the module there differs from the file name, since
+    # the file may be named jax.py, for example.
     spec = importlib.util.spec_from_file_location(f"_law_file_{Path(file).stem}", file)
     if spec is None:
         raise InputError(f"{file} is not a Python file: give FILE.py:LAW")
@@ -177,8 +180,8 @@ def check(law: Law) -> Check:
 def _finite_samples(functions: Sequence[Callable]) -> tuple[np.ndarray, np.ndarray, Row]:
     """Return deformation gradients, directions, and a row with their range of stretches.
 
-    The stretches lie in `_MODERATE`. If energy, stress or tangent is not finite there, the widest range of `_NARROWER`
-    in which all three are finite is used. If there is no such range, the row fails.
+    The stretches lie in `_MODERATE`. If energy, stress or tangent is not finite there, the stretches lie in the widest
+    range of `_NARROWER` in which all three are finite. If there is no such range, the row fails.
     """
     for low, high in (_MODERATE, *_NARROWER):
         F, D = _samples(low, high)
@@ -203,7 +206,7 @@ def _finite_samples(functions: Sequence[Callable]) -> tuple[np.ndarray, np.ndarr
 def _derivative_rows(law: Law, F: np.ndarray, stable: tuple[float, float], programs: Sequence[Callable]) -> list[Row]:
     """Return two rows that compare stress and tangent with automatic differentiation.
 
-    Each row stands for three comparisons: at moderate stretches, over the stable range, and with changed parameters
+    Each row summarises three comparisons: at moderate stretches, over the stable range, and with changed parameters
     that are not 0. The row shows the first comparison that fails. If none fails, it shows the first comparison.
     """
     low, high = max(stable[0], 0.5), min(stable[1], 2.0)
@@ -270,7 +273,7 @@ def _idle_parameters_row(law: Law, programs: Sequence[Callable], F: np.ndarray) 
     return [Row("parameters without effect", ", ".join(idle), "is the energy complete?", False)] if idle else []
 
 
-#: Methods of a law. Each is compiled once for all values of the parameters.
+#: Methods of a law that are checked. Each method is compiled once for all values of the parameters.
 _PROGRAMS = ("energy", "first_piola", "tangent")
 
 

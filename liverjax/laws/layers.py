@@ -37,8 +37,8 @@ def check(law: Law, name: str) -> None:
     """Check that a law can be used for a layer or bar.
 
     Raises:
-        InputError: the law has directions or is written in Green's strain (then the message begins with `name`), or
-            the parameters of the law contradict each other.
+        InputError: the law has directions or is written in Green's strain (in these two cases, the message begins with
+            `name`), or the parameters of the law contradict each other.
     """
     if any(one.fibre is not None or one.green_energy is not None for one in law.summands()):
         raise InputError(
@@ -54,8 +54,8 @@ def in_plane_energy(law: Law, C: tuple, solved: bool) -> jax.Array:
     Args:
         law: isotropic law.
         C: C_11, C_12, C_22 (Q, m) of the in-plane right Cauchy-Green tensor.
-        solved: whether the thickness stretch is an unknown. Then the law is evaluated at the J for which the stress
-            through the thickness is 0. Otherwise it is evaluated at J = 1.
+        solved: whether the thickness stretch is an unknown. If true, the law is evaluated at the J for which the stress
+            through the thickness is 0. If false, it is evaluated at J = 1.
     """
     f11 = jnp.sqrt(C[0])
     f12 = C[1] / f11

@@ -55,7 +55,10 @@ def find(name: str) -> type[Law]:
 
 
 def parameters(law: Any) -> list[dataclasses.Field]:
-    """Return the numeric fields of a law. `metadata` of a field has its unit, bounds and description (`about`)."""
+    """Return the numeric fields of a law.
+
+    The `metadata` of a field contain its unit, bounds and description (`about`).
+    """
     return [f for f in dataclasses.fields(law) if not f.metadata.get("static")]
 
 
@@ -117,7 +120,7 @@ def typical(name: str) -> Law:
 
 
 def scaled(law: Law, factor: Number) -> Law:
-    """Return the law with its energy multiplied by `factor`. Only parameters in Pa change: they are multiplied."""
+    """Return the law with its energy multiplied by `factor`. For this, the parameters in Pa are multiplied by it."""
 
     def one(s: Law) -> Law:
         if isinstance(s, Continued):

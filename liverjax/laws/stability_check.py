@@ -35,7 +35,7 @@ def stability_rows(law: Law, tangent: Callable) -> tuple[list[Row], dict]:
     """Return rows with the ranges around rest in which the stress increases and the law is strongly elliptic.
 
     A row fails if the rest state is not stable. A law without stiffness at rest, for example a law with only fibres, is
-    neither stable nor unstable there, so its row does not fail.
+    neither stable nor unstable at rest, so its row does not fail.
     """
     rows, ranges = [], {}
     stress = jax.jit(partial(homogeneous.nominal_stress, law))
@@ -69,7 +69,9 @@ _MISSED, _PARTS, _CUTS = 0.05, 32, 3
 
 
 def jump_rows(energy: Callable, stress: Callable, tangent: Callable) -> list[Row]:
-    """Return a row if the energy or the stress jumps, so that its change is not the integral of its derivative.
+    """Return one row if energy or stress jumps: then its change is not the integral of its derivative.
+
+    Otherwise return no row.
 
     The other checks use only single states, so they cannot find a jump.
 
@@ -77,8 +79,8 @@ def jump_rows(energy: Callable, stress: Callable, tangent: Callable) -> list[Row
         energy, stress, tangent: functions of deformation gradients (n, 3, 3).
     """
     # If a law depends only on the volume, its energy is 0 in the tests at constant volume, apart from roundoff. If a
-    # law is isochoric, its energy is 0 in the test "volume". So roundoff is compared with the larger stress of a
-    # swollen and a sheared state.
+    # law is isochoric, its energy is 0 in the test "volume". So the roundoff is estimated from the larger of two
+    # stresses: in a swollen state and in a sheared state.
     F = np.tile(1.1 * np.eye(3), (len(STRETCHES), 1, 1))
     F[0] = np.eye(3) + 0.1 * np.eye(3, k=1)
     roundoff = 1e-12 * np.nan_to_num(np.abs(as_numbers(stress, F))).max()
@@ -134,7 +136,10 @@ def _jump(missed: Callable, driven: np.ndarray, roundoff: float) -> tuple[float,
 
 
 def _work_is_positive(test: str, driven: np.ndarray, P: np.ndarray) -> np.ndarray:
-    """Return whether the nominal stress increases at each of n states (n,). At the ends, differences are one-sided."""
+    """Return whether the nominal stress increases at each of n states (n,).
+
+    At the first and the last state, one-sided differences are used.
+    """
     stress = np.asarray(homogeneous.measured(test, jnp.asarray(P)))
     with np.errstate(all="ignore"):
         return np.gradient(stress, driven) > 0

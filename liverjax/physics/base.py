@@ -20,9 +20,9 @@ There are three classes of force terms. The forces, the tangent and the energy o
   matrix.
 * `NodalForce` acts at the nodes, after assembly. It returns nodal forces and their stiffness.
 
-A `VolumeStress` has pressures at the nodes. A mixed system of equations determines positions and pressures together
-(`liverjax.simulation.mixed_system`). V is the number of nodes (for pressures the number of vertices), E the number of
-elements.
+A `VolumeStress` has pressures at the nodes. If these pressures are not known in advance, a mixed system of equations
+determines positions and pressures together (`liverjax.simulation.mixed_system`). V is the number of nodes (for
+pressures the number of vertices), E the number of elements.
 """
 
 from collections.abc import Callable, Sequence
@@ -49,7 +49,7 @@ Pairs = tuple[tuple[int, int], ...]
 class Tied(Protocol):
     """Nodes that move together in a step, for example as a rigid body.
 
-    A few unknowns define their motion. These unknowns are stored in the rows of these nodes in a nodal field (V, 3).
+    A few unknowns define the motion of these nodes. A nodal field (V, 3) stores the unknowns in the rows of the nodes.
     """
 
     @property
@@ -57,31 +57,34 @@ class Tied(Protocol):
         """Whether the positions of these nodes are a linear function of their unknowns."""
 
     def gathered(self, field: jax.Array, x: jax.Array | None = None) -> jax.Array:
-        """Project a nodal field (V, 3) onto the free motions of the nodes. Forces also need the positions x (V, 3)."""
+        """Project a nodal field (V, 3) onto the free motions of the nodes.
+
+        If the field contains forces, the positions x (V, 3) are also needed.
+        """
 
     def at(self, x: jax.Array) -> "Tied":
         """Return the same nodes with the directions of their motions at positions x (V, 3)."""
 
     def turned(self, field: jax.Array, other: Self) -> jax.Array:
-        """Return `field` (V, 3), in which the motions of these nodes have the directions of `other`.
+        """Return `field` (V, 3), changed such that these nodes move in the directions of motion of `other`.
 
         `other` are the same nodes at other positions (method `at`). The amplitudes of the motions do not change.
         """
 
     def unknown(self, field: jax.Array, x: jax.Array) -> jax.Array:
-        """Return `field` (V, 3), in which the rows of these nodes contain their unknowns for the positions x (V, 3).
+        """Return `field` (V, 3), with the unknowns of these nodes for positions x (V, 3) in the rows of these nodes.
 
         The method `placed` is the inverse of this method.
         """
 
     def placed(self, field: jax.Array, s: Number) -> jax.Array:
-        """Return `field` (V, 3), in which positions at fraction s of the step replace the unknowns of these nodes."""
+        """Return `field` (V, 3) with positions at fraction s of the step instead of the unknowns of these nodes."""
 
     def not_given(self, mask: jax.Array, axes: jax.Array | None) -> tuple[jax.Array, jax.Array | None]:
         """Return `mask` (V, 3), with 0 at nodes with a given motion, and the free directions (V, 3) of these nodes.
 
-        A node with a given motion has at most one free direction. At other nodes, the directions are 0. Instead of the
-        directions, None is returned if no node with a given motion has a free direction.
+        A node with a given motion has at most one free direction. At other nodes, the directions are 0. If no node with
+        a given motion has a free direction, None is returned instead of the directions.
         """
 
     def rigid(self, x: jax.Array, velocity: jax.Array, acceleration: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -156,11 +159,11 @@ class End(NamedTuple):
     x: jax.Array  # (V, 3) [m] positions
     F: Matrix  # deformation gradients (E,), or (Q, E) with Q integration points per element
     pressure: Any  # (V,) [Pa] at the nodes, or None
-    by_end_forces: jax.Array | None = None  # (V, 3) [m/s^2] acceleration due to terms with `at_end`, times -1
+    by_end_forces: jax.Array | None = None  # (V, 3) [m/s^2] acceleration due to force terms with `at_end`, times -1
 
 
 class Solid:
-    """A force term of one step. Its stress in an element depends only on the deformation gradient."""
+    """A force term of one step whose stress in an element depends only on the deformation gradient."""
 
     def stress(self, F: Matrix) -> Matrix:
         """Return the first Piola-Kirchhoff stress [Pa]."""
@@ -186,10 +189,10 @@ class Solid:
 
 
 class VolumeStress:
-    """A force term of one step. Its stress depends on the volume ratio of elements and on pressures at nodes."""
+    """A force term of one step whose stress depends on the volume ratio of elements and on pressures at nodes."""
 
-    #: Whether the pressures depend on the positions at the end of the step. If true, the mixed system contains the
-    #: pressures.
+    #: Whether the pressures are a function of the positions at the end of the step. If true, the mixed system contains
+    #: the pressures.
     coupled: ClassVar[bool] = True
     #: Whether the pressures are unknowns of Newton's method (`liverjax.physics.volumes.mixed`). If false, they are
     #: eliminated or known.
@@ -225,8 +228,8 @@ class VolumeStress:
 class NodalForce:
     """A force term of one step with forces at nodes."""
 
-    #: Whether the term has a stiffness at every node. If true, the linear solver also reduces errors of long wavelength
-    #: quickly.
+    #: Whether the term has a stiffness at every node, equal for all axes. If this stiffness is large, the
+    #: preconditioner uses no coarse space.
     everywhere: ClassVar[bool] = False
     #: Whether the force has an energy. A follower force has no energy, and its stiffness is not symmetric.
     conservative: bool = True
@@ -275,14 +278,15 @@ class NodalForce:
     def gives_way(self, mesh: TetMesh, x: jax.Array, s: Number, definite: bool) -> GivesWay | None:
         """Return the loss of stiffness due to an eliminated unknown, for example the displacement of an obstacle.
 
-        The argument `definite` selects the stiffness that loses a part: if true, the stiffness from the method
-        `definite`, otherwise the stiffness from the method `attached`.
-        Returns None if there is no such unknown.
+        If the argument `definite` is true, this loss is subtracted from the result of the method `definite`, otherwise
+        from the result of the method `attached`. Returns None if there is no such unknown.
         """
         return None
 
     def predicted(self) -> jax.Array | None:
-        """Return the positions (V, 3) [m] that the body would reach without forces. Newton's method can start there.
+        """Return the positions (V, 3) [m] that the body would reach without forces.
+
+        Newton's method can start at these positions.
 
         Returns None if these positions are unknown.
         """
@@ -307,7 +311,7 @@ class NodalForce:
 class Physics:
     """Base class of all physics objects (supports, loads, contact, …), which are structs of numbers.
 
-    The docstring of the module explains the methods.
+    The docstring of the module explains the main methods.
     """
 
     #: All subclasses are structs, so `dataclasses.replace` can be used with their objects.
@@ -348,7 +352,7 @@ class Physics:
         """
 
     def in_body(self, mesh: TetMesh, law: Any) -> "Physics":
-        """Return the same physics. Numbers that the user did not give are set to values from the law of the body."""
+        """Return this physics, with values from the law of the body for the numbers that the user did not give."""
         return self
 
     def at_beginning(self) -> "Physics":
@@ -383,8 +387,8 @@ class Physics:
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
         """Return n node numbers (n,) and the directions (n, 3) in which this physics constrains these nodes.
 
-        If each of n constraints contains m nodes, the shapes are (n, m) and (n, m, 3). Then the sum of the m
-        displacements along their directions is constrained.
+        If each of n constraints contains m nodes, the shapes are (n, m) and (n, m, 3). In this case, each constraint
+        fixes the sum of m displacements: one of each node along the given direction.
         """
         return np.zeros(0, int), np.zeros((0, 3))
 

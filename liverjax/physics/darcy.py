@@ -2,9 +2,9 @@
 
     (1/K_lim) dP/dt = kappa lap P - (dJ/dt)/J
 
-J is the volume ratio, kappa the permeability, lap the Laplacian, and 1/K_lim the stored fluid volume per volume and
-pressure. The equation uses the volumes at the beginning of a step, so that it is linear in P. Its discrete form is the
-pressure equation A P = b, with the pressure matrix A.
+J is the volume ratio, kappa the permeability, lap the Laplacian, and 1/K_lim the fluid volume stored per volume of the
+body and per pressure. The equation uses the volumes at the beginning of a step, so that it is linear in P. Its discrete
+form is the pressure equation A P = b, with the pressure matrix A.
 """
 
 from typing import Any, NamedTuple
@@ -22,7 +22,8 @@ from liverjax.solvers.krylov import Known, chebyshev, differentiable_solve
 from liverjax.solvers.preconditioner import Coarse
 from liverjax.tensors.matrices import Matrix, dot
 
-#: Elements with a smaller volume ratio J (flat or inverted) store and conduct fluid as if they had this J.
+#: Minimum volume ratio J. In elements with a smaller J (flat or inverted), storage and flow are computed with this
+#: value.
 LEAST_J = 1e-3
 
 
@@ -93,8 +94,8 @@ def _least_eigenvalue(mesh: TetMesh, rate: Number, store: jax.Array, diagonal: j
         fastest, mean = jnp.max(rate), jnp.sum(rate * mesh.weights) / jnp.sum(mesh.volumes)
         total, rate = stored + (total - stored) * fastest / jnp.where(mean > 0, mean, 1.0), fastest
     # The numerator of the estimate is the storage plus the Darcy flow of a pressure wave with wave number 5 / (width of
-    # a patch of the coarse space). In numerical tests, this number was 4.9 to 5.4 instead of 5. The coarse space
-    # corrects longer waves.
+    # a patch of the coarse space). In numerical tests, this number was 4.9 to 5.4 instead of 5. Errors with longer
+    # waves are corrected in the coarse space.
     waves = rate * (5 / mesh.pattern.patch_width) ** 2 * jnp.sum(mesh.volumes)
     return (stored + waves) / total
 
@@ -137,7 +138,7 @@ def solved(mesh: TetMesh, flow: Flow, b: jax.Array, guess: Guess | None = None) 
 
     def apply(p):
         # For given pressures, the rows of the matrix are rows of the identity, since the right-hand side of an adjoint
-        # solve may be nonzero there.
+        # solve may be nonzero in these rows.
         return flow.mask * flow_product(flow, flow.mask * p) + (1 - flow.mask) * p
 
     diagonal = flow.mask * flow.matrix.diagonal[0][0] + (1 - flow.mask)
@@ -172,15 +173,15 @@ def flow_product(flow: Flow, p: jax.Array) -> jax.Array:
     return flow.store * p + jnp.sum(rows * (p[nodes] - p[None]), axis=0)
 
 
-#: Relative error of the polynomial by which the inverse of the pressure matrix is approximated for Newton's direction.
+#: Relative error of the polynomial that approximates the inverse of the pressure matrix in Newton's direction.
 _POLYNOMIAL_ERROR = 0.1
 
 
 def nearly_solved(mesh: TetMesh, flow: Flow, b: jax.Array) -> jax.Array:
     """Solve A p = b for b (V,) approximately, with the pressure matrix A.
 
-    The approximate inverse is linear, symmetric and positive definite. It is exact for long waves, which the coarse
-    space represents. For the other waves it is a polynomial of the matrix.
+    The approximate inverse is linear, symmetric and positive definite. It is exact in the coarse space, which
+    represents pressures of long wavelength. For other pressures it is a polynomial of D^-1 A, with the diagonal D of A.
     """
     d = flow.matrix.diagonal[0][0]
     degree = jnp.ceil(0.5 * jnp.sqrt(flow.high / flow.low) * jnp.log(2 / _POLYNOMIAL_ERROR)).astype(jnp.int32)

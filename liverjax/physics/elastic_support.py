@@ -103,7 +103,7 @@ class ElasticSupport(Physics):
         return kind(blocks=tuple(tuple(after * entry for entry in row) for row in own), **given)
 
     def pulls_single_nodes(self) -> bool:
-        """Return whether the springs are given for nodes. If not, they are given per area."""
+        """Return whether the springs act at nodes. If not, they act on an area."""
         return self.triangles is None
 
     def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "ElasticSupport":
@@ -113,7 +113,7 @@ class ElasticSupport(Physics):
         return replace(self, triangles=promotion.with_faces(mesh, self.triangles))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Return nodes (n,) and directions (n, 3): the principal axes along which the springs of a node are stiff."""
+        """Return nodes (n,) and directions (n, 3): the principal axes of the springs that have a stiffness."""
         K = np.moveaxis(np.array([[np.asarray(e) for e in row] for row in blocks(self, mesh)]), -1, 0)
         size, axes = np.linalg.eigh(K)
         node, axis = np.nonzero(size > 1e-9 * max(size.max(), 1e-300))
@@ -121,7 +121,10 @@ class ElasticSupport(Physics):
 
 
 def _refuse_idle(support: ElasticSupport, keys: tuple[str, ...], name: str, instead: str) -> None:
-    """Raise InputError if a stiffness of the other kind of springs (`keys`) is not 0, since it would have no effect."""
+    """Raise InputError if one of the stiffnesses `keys` is not 0.
+
+    They belong to the other kind of springs, so they would have no effect.
+    """
     for key in keys:
         if np.any(np.asarray(getattr(support, key)) != 0):
             raise InputError(f"{name}.{key} = {getattr(support, key)} has no effect: {instead}")

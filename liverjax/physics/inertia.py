@@ -1,10 +1,10 @@
 """Inertia of lumped or consistent masses, with implicit Euler or Newmark's method (average acceleration).
 
-Newmark's method uses the mean of the forces at both ends of a step. The forces of an obstacle with a given position are
-an exception: only their value at the end of the step is used (Kane et al. 1999, Comput. Methods Appl. Mech. Eng. 180,
-1). Then an obstacle at rest never adds energy to the body. With the mean of the forces, the obstacle would add energy
-if contact begins or ends within a step. The stored acceleration (`Motion`) does not contain the part due to these
-obstacle forces.
+Newmark's method uses the mean of the forces at the beginning and at the end of a step. The forces of an obstacle with a
+given position are an exception: only their value at the end of the step is used (Kane et al. 1999, Comput. Methods
+Appl. Mech. Eng. 180, 1). Then an obstacle at rest never adds energy to the body. With the mean of the forces, the
+obstacle would add energy if contact begins or ends within a step. The stored acceleration (`Motion`) does not contain
+the part due to these obstacle forces.
 """
 
 from typing import Any, ClassVar, NamedTuple
@@ -21,8 +21,8 @@ from liverjax.solvers.attached import Masses, masses
 from liverjax.solvers.block_matrix import Block
 from liverjax.tensors.places import given
 
-#: Factor k for each method. The acceleration at the end of a step is k x/dt^2 plus terms that are known at its
-#: beginning, with positions x at the end and time step dt.
+#: Factor k for each method. The acceleration at the end of a step is k x/dt^2 plus known terms, with the positions x at
+#: the end of the step and the time step dt.
 FACTOR = {"euler": 1.0, "newmark": 4.0}
 #: Relative tolerance of the linear solves for the accelerations.
 _EXACT = 1e-12
@@ -78,8 +78,8 @@ class Inertia(Physics):
     def masses_on(self, mesh: TetMesh) -> tuple[jax.Array, Masses | None]:
         """Return the diagonal masses (V,) [kg] of the nodes, and the remaining part of the consistent mass matrix.
 
-        The remaining part is the consistent mass matrix minus the diagonal masses. It is None if the mass is lumped.
-        With one density per node, the consistent masses of an element have one density (`element_density`).
+        The remaining part is the consistent mass matrix minus the diagonal masses. It is None if the mass is lumped. If
+        the density is given per node, the consistent mass matrix of an element uses one density (`element_density`).
         """
         if self.mass == "lumped":
             return self.density * nodal_volumes(mesh), None
@@ -108,7 +108,7 @@ def _accelerations(mass: jax.Array, shared: Masses | None, free: Free, force: ja
         return force / mass[:, None]
 
     # In reverse-mode differentiation, the right-hand side may have components in fixed directions. So the matrix must
-    # be regular there too.
+    # be invertible in these directions too.
     mean = jnp.mean(mass)
 
     def product(a: jax.Array) -> jax.Array:
@@ -168,7 +168,7 @@ class Moving(NodalForce):
         return velocity, acceleration
 
     def _where_free(self, own: jax.Array, given: jax.Array) -> jax.Array:
-        """Return a field (V, 3) that is `own` in free directions and `given` in directions of a given motion."""
+        """Return a field (V, 3): `own` in free directions, and `given` in directions with a given motion."""
         out = jnp.where(self.mask > 0, own, given)
         return out if self.axes is None else out + jnp.sum(self.axes * (own - given), axis=1, keepdims=True) * self.axes
 

@@ -33,7 +33,7 @@ class Traction:
     )
 
     def at(self, time: Number) -> "Traction":
-        """Return the load at a time [s], without its history."""
+        """Return this load at a time [s] as a constant load. A load without a history does not change."""
         if self.history is None:
             return self
         now = history.value_at(self.value if self.pressure is None else self.pressure, time, self.times, self.history)
@@ -80,7 +80,7 @@ def follower_forces(tractions: tuple, x: jax.Array, mesh: TetMesh | None = None)
 def dead_loads(mesh: TetMesh, density: Number, gravity: Numbers, tractions: tuple, mass: str) -> jax.Array:
     """Return the nodal forces (V, 3) [N] of the dead loads: tractions, and the weight if `density` is not None.
 
-    `mass` is the kind of masses of the body, lumped or consistent (`weighing_masses`).
+    `mass` is the kind of mass matrix of the body, lumped or consistent (`weighing_masses`).
     """
     force = jnp.zeros(mesh.points.shape, mesh.points.dtype)
     if density is not None:
@@ -110,7 +110,7 @@ class Loads(Physics):
         return self._loading(step, "steps" if step.dt is None else "none" if step.inertia else "first")
 
     def at(self, time: Number) -> "Loads":
-        """Return the loads at a time [s], without their histories."""
+        """Return these loads at a time [s] as constant loads, without histories."""
         traction = tuple(load.at(time) for load in self.traction)
         gravity = history.value_at(self.gravity, time, self.times, self.history)
         return replace(self, gravity=gravity, traction=traction, times=None, history=None)

@@ -3,11 +3,11 @@
     sigma_p = sigma_Heq(J) - P,   (1/K_lim) dP/dt = kappa lap P - (dJ/dt)/J
 
 sigma_p is the volumetric stress, J the volume ratio, P the pressure of the fluid at the nodes, kappa the permeability,
-lap the Laplacian, and 1/K_lim the stored fluid volume per volume and pressure. The Kerdok-Hencky stress is sigma_Heq =
-K0 r_w ln((r_w + J - 1)/r_w), with the drained bulk modulus K0 and the fluid fraction r_w. Below J0 = 1 - r_w + r_w
-K0/K_lim this stress is replaced by its tangent line at J0, which has the slope K_lim. (The chapter prints J0 without
-the factor r_w. Without this factor, the slope would be r_w K_lim.) The pressure equation uses the volumes at the
-beginning of a step, so that it is linear in P. There are two schemes:
+lap the Laplacian, and 1/K_lim the fluid volume stored per volume of the body and per pressure. The Kerdok-Hencky stress
+is sigma_Heq = K0 r_w ln((r_w + J - 1)/r_w), with the drained bulk modulus K0 and the fluid fraction r_w. Below J0 = 1 -
+r_w + r_w K0/K_lim this stress is replaced by its tangent line at J0, which has the slope K_lim. (The chapter prints J0
+without the factor r_w. Without this factor, the slope would be r_w K_lim.) The pressure equation uses the volumes at
+the beginning of a step, so that it is linear in P. There are two schemes:
 
 * "implicit": P at the end of the step follows from the volume change of the same step. P is a function of the positions
   x and is eliminated. The equations for x are symmetric, and stable for any time step. Newton's direction is computed
@@ -53,7 +53,7 @@ class Inlet:
     def at(self, value: object, time: Number) -> jax.Array:
         """Return the given pressure [Pa] or flux [m/s] of this inlet at a time [s].
 
-        `value` is the value without history.
+        `value` is the pressure or flux before it is multiplied by the factor of the history.
         """
         return history.value_at(value, time, self.times, self.history)
 
@@ -93,7 +93,7 @@ class Porosity(Physics):
         # In a static run the first positions are only a guess, so the first step begins at the reference shape.
         x = step.x if step.inertia else jnp.where(step.k == 1, step.mesh.points, step.x)
         F = deformation_gradient(step.mesh, x)
-        J = determinant(F)  # if a run begins at other positions, `memory.J` is still 1 there
+        J = determinant(F)  # at the beginning of a run, `memory.J` is 1 even if x is not the reference shape
         found = darcy.flow(self, step.mesh, J, F, step.dt, 1e-2 * step.tolerance)
         if self.inlet:
             given, enters = inflow(self, step.mesh, step.k * step.dt, step.dt)
@@ -207,7 +207,7 @@ def bulk_in_force(porosity: Porosity, law: Law) -> str:
 
 
 def _fluid_ratio(porosity: Porosity, J: Number) -> jax.Array:
-    """Return u = (r_w + J - 1)/r_w, or the value K0/K_lim of u at J0 if this is larger.
+    """Return u = (r_w + J - 1)/r_w, or the value K0/K_lim of u at J0 if this value is larger.
 
     In single precision, J0 may round to 1 - r_w. Without the bound K0/K_lim, u would then be 0, and ln u infinite.
     """
@@ -266,8 +266,8 @@ def _volume_per_area(inlet: Inlet, time: Number, dt: Number) -> Number:
 def inflow(porosity: Porosity, mesh: TetMesh, time: Number, dt: Number) -> tuple[jax.Array, jax.Array]:
     """Return the given pressures (V,) [Pa] and the inflow (V,) [m^3] of a step, for `darcy.Flow`.
 
-    The step has the length dt [s] and ends at `time` [s]. The pressures are those at its end. The inflow is the time
-    integral of the flux over the step.
+    The step has the length dt [s] and ends at `time` [s]. The pressures are those at the end of the step. The inflow is
+    the time integral of the flux over the step.
     """
     given = enters = jnp.zeros(mesh.number_of_vertices, mesh.points.dtype)
     for inlet in porosity.inlet:

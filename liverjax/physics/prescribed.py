@@ -90,9 +90,9 @@ def prescribed(mesh: TetMesh, displaced: tuple, time: Number, fraction: Number) 
 def given_acceleration(place: Callable[[Number], jax.Array], k: Number, steps: int, dt: Number) -> jax.Array:
     """Return the acceleration (V, 3) [m/s^2] of a given motion at the end of step k, with an error of order dt^2.
 
-    It is the central second difference of the positions. At the last step, where the next position is unknown, it is
-    extrapolated. For k = 0, the motion begins at rest. If the velocity jumps to v at the beginning, the result is 2
-    v/dt, so that Newmark's method applies the whole impulse in the first step.
+    It is the central second difference of the positions. At the last step, the next position is unknown, so the
+    acceleration is extrapolated. For k = 0, the nodes are at rest before the motion begins. If the velocity jumps to v
+    at the beginning, the result is 2 v/dt, so that Newmark's method applies the whole impulse in the first step.
 
     Args:
         place: function k -> positions (V, 3) [m] after k steps.

@@ -70,7 +70,7 @@ class RigidPlate(Physics):
         return Plate(self, X, X, zero, zero)
 
     def tied(self, step: Step) -> "Plate":
-        """Return the nodes of the plate during a step, with the given angle or torque at both ends of the step."""
+        """Return the nodes of the plate during a step, with the given angle or torque at its beginning and end."""
         before = after = jnp.asarray(self.turn)
         if self.times is None and self.by == "torque" and step.dt is None:
             # A torque grows with the load steps like other loads.
@@ -101,16 +101,17 @@ class RigidPlate(Physics):
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
         """Return pairs of nodes (n, 2) and their directions (n, 2, 3), for n constraints of the plate.
 
-        Each node of the plate is fixed towards the axis, around it and along it. If the plate itself can move in this
-        way, only the difference to the node farthest from the axis is fixed.
+        The motion of each node is constrained in three directions: towards the axis, around the axis and along the
+        axis. If the plate can move in one of these directions, only the motion relative to the node farthest from the
+        axis is constrained.
         """
-        # With float64, roundoff does not look like a constraint.
+        # In float64, roundoff is too small to be mistaken for a constraint.
         nodes, axis, centre = np.asarray(self.nodes), np.asarray(self.axis, float), np.asarray(self.centre, float)
         arms = np.cross(axis, np.asarray(mesh.points, float)[nodes] - centre)
         radii, axis = np.linalg.norm(arms, axis=1), np.broadcast_to(axis, arms.shape)
         far = int(np.argmax(radii))
         some, ratio = arms[far] / radii[far], (radii / radii[far])[:, None]
-        # On the axis, all directions around it are equally good.
+        # For a node on the axis, any direction perpendicular to the axis can be used.
         around = np.where(ratio > 1e-9, arms / np.maximum(radii, 1e-300)[:, None], some)
         free = (0 * arms, ratio * some * (self.by == "torque"), axis * self.lifts)  # motions of the farthest node
         own = (np.cross(around, axis), around, axis)
@@ -221,7 +222,7 @@ class Plate(NamedTuple):
         return self._replace(carrier=x[self.plate.nodes])
 
     def turned(self, field: jax.Array, other: "Plate") -> jax.Array:
-        """Return `field` (V, 3), in which the plate's motions have the directions of `other` (same plate, moved)."""
+        """Return `field` (V, 3), changed such that the plate moves in the directions of `other` (same plate, moved)."""
         return other.spread(field, *self.amplitudes(field, self._arms(self.carrier)))
 
     def given(self, s: Number) -> jax.Array:
@@ -229,12 +230,12 @@ class Plate(NamedTuple):
         return self.before + s * (self.after - self.before)
 
     def unknown(self, field: jax.Array, x: jax.Array) -> jax.Array:
-        """Return `field` (V, 3), in which the rows of the plate's nodes contain its unknowns for positions x (V, 3)."""
+        """Return `field` (V, 3) with the plate's unknowns for the positions x (V, 3), in the rows of its nodes."""
         turn = self.radius * self.angle(x) if self.plate.by == "torque" else 0.0
         return self.spread(field, turn, len(self.reference) ** 0.5 * self.lift(x))
 
     def placed(self, field: jax.Array, s: Number) -> jax.Array:
-        """Return `field` (V, 3), in which positions [m] at fraction s of the step replace the plate's unknowns."""
+        """Return `field` (V, 3) with positions [m] at fraction s of the step instead of the plate's unknowns."""
         turn, lift = self.amplitudes(field, self._arms(self.carrier))
         angle = turn / self.radius if self.plate.by == "torque" else self.given(s)
         return self.moved(field, angle, lift / len(self.reference) ** 0.5)

@@ -112,7 +112,9 @@ def check_part(part: str, law: Law, section: str) -> None:
 
 
 def check_series(prony: Prony) -> None:
-    """Check that ratios and times form a Prony series. If they are unknown inside jit, only their number is checked.
+    """Check that ratios and times form a Prony series.
+
+    Inside jit their values may be unknown. Then only the number of ratios and the number of times are compared.
 
     Raises:
         InputError: there are not as many ratios as relaxation times, a value is out of bounds, or the ratios add up to
@@ -231,7 +233,7 @@ def relaxed_history(prony: Prony, stress: jax.Array) -> History:
 
 
 def recall(prony: Prony, history: History, dt: Array) -> Recall:
-    """Return the contribution to the stress in the next step, from the history variables at its beginning."""
+    """Return the contribution to the stress in a step, from the history variables at the beginning of the step."""
     a, b, c = coefficients(prony, dt)
     if a.ndim == 2:
         return _recall_by_element(a, b, c, history)
@@ -243,7 +245,7 @@ def recall(prony: Prony, history: History, dt: Array) -> Recall:
 
 
 def _recall_by_element(a: jax.Array, b: jax.Array, c: jax.Array, history: History) -> Recall:
-    """Return the same as `recall`, for coefficients a, b, c (N, E) with one value per mode and element."""
+    """Return the result of `recall` for coefficients a, b, c (N, E) with one value per mode and element."""
     ndim = history.gamma.ndim
     past = jnp.sum(_beside(b, ndim) * history.gamma, axis=0)
     if history.stress is not None:
@@ -327,7 +329,7 @@ class Viscoelasticity(Physics):
     def begin(self, start: Start) -> History:
         """Return the history variables at the beginning of a run, which are zeros.
 
-        If the body was just moved to its positions, the stored stress S^n is the stress at these positions.
+        Exception: if the body was just moved to its positions, the stored stress S^n is the stress at these positions.
         """
         memory = initial_history(self.prony, start.mesh.weights.shape, start.x.dtype)
         if memory.stress is None or not start.moved:
@@ -378,7 +380,7 @@ class Viscoelastic(Solid):
         return W if rest is None else W + rest.strain_energy(rest.measures(F))
 
     def parts(self) -> tuple[list[tuple[Any, Any]], Matrix]:
-        """Return the pairs (weight, law) of the relaxing and the other part of the law, and the stress -`past` [Pa]."""
+        """Return pairs (weight, law) for the relaxing part and the rest of the law, and the stress -`past` [Pa]."""
         rest = volumetric_part(self.law) if self.prony.part == "isochoric" else None
         weighted = [(self.recall.now, relaxing(self.prony, self.law))]
         return weighted if rest is None else [*weighted, (1.0, rest)], scale_matrix(-1.0, self.recall.past)

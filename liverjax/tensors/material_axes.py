@@ -71,7 +71,10 @@ def anisotropic(T: list, a: Vector) -> Matrix:
 
 
 def _contract(values: list, a: Vector) -> jax.Array:
-    """Return the scalar product of `values` and `a`, without terms in which `a` is the Python number 0 (a constant)."""
+    """Return the scalar product of `values` and `a`.
+
+    Terms in which an entry of `a` is the Python number 0 are omitted.
+    """
     terms = [v if isinstance(c, float) and c == 1 else v * c for v, c in zip(values, a, strict=True) if not _is_zero(c)]
     return sum(terms[1:], terms[0])
 

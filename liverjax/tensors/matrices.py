@@ -137,7 +137,7 @@ def stored(values: T) -> T:
     """Return a pytree with the same values, stored in memory (RAM).
 
     Without the branch (`lax.cond`) in this function, XLA on the CPU would compute the values again for every use. The
-    leaves are numbers or arrays. At least one of them is not empty.
+    leaves are numbers or arrays. At least one leaf must not be empty.
     """
     values = jax.tree.map(jnp.asarray, values)
     number = max(jax.tree.leaves(values), key=jnp.size).ravel()[0]
@@ -157,8 +157,8 @@ def deformation_gradient(mesh: Any, x: jax.Array) -> Matrix:
         x: current positions (V, 3) [m]. For another field (V, 3), the result is the gradient of that field.
 
     Raises:
-        InputError: x does not have the shape (V, 3). Without this check, node numbers that are too large would read the
-            last node, without an error.
+        InputError: x does not have the shape (V, 3). Without this check, a node number that is too large would give the
+            position of the last node, without an error.
     """
     if jnp.shape(x) != mesh.points.shape:
         raise InputError(

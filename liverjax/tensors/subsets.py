@@ -54,7 +54,7 @@ def in_subset(s: Subsets, k: int, numbers: T) -> T:
 
     def one(a: Number) -> Number:
         shape = jnp.shape(a)
-        if shape[-2:] == (E, 3):  # comes first, because a body of three elements has arrays (3, 3) of directions
+        if shape[-2:] == (E, 3):  # tested first: in a body of three elements, arrays of directions are (3, 3)
             return jnp.asarray(a)[..., own, :]
         return jnp.asarray(a)[..., own] if shape[-1:] == (E,) else a
 

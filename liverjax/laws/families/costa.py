@@ -89,5 +89,5 @@ class Costa(Law):
 
     @classmethod
     def guccione(cls, *, c: Number, b_f: Number, b_t: Number, b_fs: Number, bulk: Number, **directions: Any) -> "Costa":
-        """Make the law of Guccione et al. 1991: b_ff = b_f, b_ss = b_nn = b_sn = b_t, b_fs = b_fn = b_fs."""
+        """Make the law of Guccione et al. 1991, with b_ff = b_f, b_ss = b_nn = b_sn = b_t and b_fn = b_fs."""
         return cls(c=c, b_ff=b_f, b_ss=b_t, b_nn=b_t, b_sn=b_t, b_fs=b_fs, b_fn=b_fs, bulk=bulk, **directions)

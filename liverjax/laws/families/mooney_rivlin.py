@@ -27,7 +27,8 @@ def _monomial(coefficient: float, *factors: tuple[Any, int]) -> Number:
 class MooneyRivlin(Law):
     """W = sum c_ij (Ibar1 - 3)^i (Ibar2 - 3)^j + U(J), i + j <= 3.
 
-    Book chapter, Table 1. A coefficient that is not given is 0. Its term is not computed, and it cannot be fitted.
+    Book chapter, Table 1. A coefficient that is not given is 0. The term of this coefficient is not computed, and the
+    coefficient cannot be fitted.
     """
 
     c10: Number = param("Pa", "coefficient of (Ibar1 - 3)", typical=300.0)
@@ -53,7 +54,7 @@ class MooneyRivlin(Law):
         return sum(c * _monomial(1.0, (a, i), (b, j)) for c, i, j in self.terms())
 
     def isochoric_derivatives(self, I1, I2):
-        """Return the first and second derivatives of the polynomial, without those that are always 0."""
+        """Return the first and second derivatives of the polynomial, without derivatives that are always 0."""
         a, b = I1 - 3, I2 - 3
         first, second = {}, {}
         for c, i, j in self.terms():

@@ -37,7 +37,7 @@ class NeoHookean(Law):
 class NeoHookeanCompressible(Law):
     """W = mu/2 (I1 - 3) - mu ln J + lambda/2 ln^2 J.
 
-    This is the compressible form of the literature (Bonet and Wood 2008, eq. 6.27). W is infinite at J = 0.
+    This is a compressible form from the literature (Bonet and Wood 2008, eq. 6.27). W is infinite at J = 0.
     """
 
     mu: Number = param("Pa", "shear modulus", above=0.0, typical=770.0)

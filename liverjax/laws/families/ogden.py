@@ -16,8 +16,8 @@ from liverjax.laws.base import Law
 class Ogden(Law):
     """W = sum_k mu_k/alpha_k (Xi(alpha_k) - 3) + U(J).
 
-    Book chapter, Table 1; Ogden 1972. Some authors write mu_k/alpha_k^2. Their mu_k is alpha_k times the mu_k of this
-    law. The law is stable for every stretch if mu_k alpha_k > 0 for all k.
+    Book chapter, Table 1; Ogden 1972. Some authors write mu_k/alpha_k^2. The mu_k of these authors is alpha_k times the
+    mu_k of this law. The law is stable for every stretch if mu_k alpha_k > 0 for all k.
     """
 
     mu: Sequence[float] | Array = param("Pa", "mu_k, one for each term", each=True, typical=(700.0, -40.0))

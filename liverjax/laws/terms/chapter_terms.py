@@ -3,7 +3,7 @@ h^k(J). The stiffness has six terms for every product.
 
 This is a variant for comparison. The default, `liverjax.laws.terms.invariant_terms`, first adds the scalar derivatives
 of all products. The default gives the same values up to roundoff, and its cost does not grow with the number of
-products. `liverjax.laws.terms.products` writes the laws as such products.
+products. `liverjax.laws.terms.products` writes the laws as sums of such products.
 """
 
 from typing import NamedTuple
@@ -109,7 +109,7 @@ def first_piola(law: Energies, F: Matrix) -> Matrix:
 
 
 def constant_matrices(D: list[Vector], pairs: tuple) -> list[tuple[Matrix, jax.Array]]:
-    """Return D_i (x) D_j and D_i . D_j for every pair of shape vectors: constant parts of the chapter's L and U."""
+    """Return constant parts of the chapter's matrices L and U: D_i (x) D_j and D_i . D_j for pairs of shape vectors."""
     return [(outer(D[i], D[j]), dot(D[i], D[j])) for i, j in pairs]
 
 
@@ -134,8 +134,8 @@ def blocks(
 ) -> list[Matrix]:
     """Return stiffness matrices d2W/dx_i dx_j per reference volume, for pairs (i, j) of nodes with shape vectors D.
 
-    A matrix is the sum over k of the chapter's terms G + H + I + Lambda + M + R, plus the term with phi''.
-    `regularised` changes the term G of every product, but not the term with phi''.
+    A matrix is the sum of the chapter's terms G + H + I + Lambda + M + R over all products, plus the term with phi'' of
+    each group of products. `regularised` changes the term G of every product, but not the term with phi''.
     """
     keep = _written if layout.write else lambda values: values
     s = keep(_state_at(law, F))

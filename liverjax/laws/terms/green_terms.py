@@ -73,7 +73,7 @@ def _stress_of_strain(law: Energies, E: Matrix) -> Matrix:
 
 
 def _slopes(function: Any, six: tuple) -> list:
-    """Differentiate with respect to the six entries of a symmetric E. For a shear, E_ij and E_ji each get a half."""
+    """Differentiate with respect to the six entries of a symmetric E. For a shear, E_ij and E_ji each change by 1/2."""
     result = []
     for k, (i, j) in enumerate(SIX):
         weight = 1.0 if i == j else 0.5

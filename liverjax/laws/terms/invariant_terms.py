@@ -40,7 +40,7 @@ from liverjax.tensors.subsets import Subsets, in_subset, put_together
 
 
 class Stress(NamedTuple):
-    """Stress P = F S + p cof F, with p = dW/dJ. `S` is a symmetric matrix, or one array if it is a multiple of Id."""
+    """Stress P = F S + p cof F, with p = dW/dJ. `S` is a symmetric matrix, or an array s for the matrix s Id."""
 
     S: Matrix | Any
     p: jax.Array
@@ -56,7 +56,7 @@ class Scalars(NamedTuple):
 class State(NamedTuple):
     """Values at one deformation gradient that both force and stiffness need."""
 
-    laws: tuple  # summands of the law; their energies of stretches and of Green's strain are added
+    laws: tuple  # summands of the law, for their energies of stretches and of Green's strain
     F: Matrix
     C: Matrix | None
     cof: Matrix
@@ -213,7 +213,7 @@ class _Parts(NamedTuple):
 def _parts(s: State, D: list[Vector], pairs: tuple[tuple[int, int], ...]) -> _Parts:
     """Compute the values that the stiffness of all node pairs needs, and write these values to memory.
 
-    Otherwise, on CPUs, JAX would compute these values again for each matrix entry, which is 20 % slower.
+    Without this, JAX on CPUs would compute these values again for each matrix entry, which is 20 % slower.
     """
     S, p = stress(s)
     metric = {(i, j): dot(D[i], D[j]) for i, j in pairs}
@@ -226,7 +226,7 @@ def _parts(s: State, D: list[Vector], pairs: tuple[tuple[int, int], ...]) -> _Pa
 
 
 def _block(s: _Parts, pair: tuple[int, int], regularised: bool) -> Matrix:
-    """Return the stiffness between two nodes, without energies of stretches and of Green's strain."""
+    """Return the stiffness between two nodes, without the parts from energies of stretches and of Green's strain."""
     vi, vj = s.slopes[pair[0]], s.slopes[pair[1]]
     second = dict(s.second)
     W_JJ = second.pop(("J", "J"), None) if regularised else None
@@ -272,8 +272,9 @@ def blocks(
         s: `state` of the element.
         D: shape vectors of the nodes of the element [1/m].
         pairs: pairs (i, j) of nodes, as indices into D. The result has one matrix for each pair.
-        regularised: whether to replace G as in section 4.1.2 iii of the book chapter. Here eps/3 is used where the
-            chapter prints eps, so that the trace does not change.
+        regularised: whether to replace G as in section 4.1.2 iii of the book chapter, with eps = 1 - J, limited to the
+            range from 0 to 1. In the term with the identity matrix, eps/3 is used where the chapter prints eps, so that
+            the trace of G does not change.
     """
     if isinstance(s, Pieces):
         own = [blocks(each, in_subset(s.subsets, k, D), pairs, regularised) for k, each in enumerate(s.states)]

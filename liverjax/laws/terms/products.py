@@ -49,7 +49,7 @@ def _isochoric(c: Number, i: int, j: int) -> list[Product]:
 def groups(law: Law) -> list[Group]:
     """Return groups of products whose sum is the energy of a law, without constants and terms that depend only on J.
 
-    `law` is not a sum of laws.
+    `law` must not be a sum of laws.
 
     Raises:
         InputError: the energy is not a function of such products.

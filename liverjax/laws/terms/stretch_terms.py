@@ -9,10 +9,11 @@ tau_m = dw/d ln lambda_m. The moduli are
     C_mnmn = (S_m - S_n) / (lambda_m^2 - lambda_n^2).
 
 The formula for C_mnmn is evaluated such that it is exact if stretches are equal. The A H A form of the book chapter
-(section 4.1.2) has a geometric mean instead. This mean is correct only for alpha = 2 and 4.
+(section 4.1.2) contains a geometric mean instead of this formula. This mean is correct only for alpha = 2 and 4.
 
-Values are computed with these formulas. Their derivatives are computed from the energy, expanded in frozen principal
-axes (`liverjax.tensors.principal`). If stretches are equal, this expansion is smooth, but the principal axes are not.
+The values of stress and moduli are computed with these formulas. Other derivatives are computed from an expansion of
+the energy, in which the principal axes are constant (`liverjax.tensors.principal`). If stretches are equal, this
+expansion is smooth, but the principal axes are not.
 """
 
 from functools import partial

@@ -24,7 +24,8 @@ _BAND = 2.0
 #: tube.
 _LEAST = 5
 #: A ring may be interrupted, for example by a hole of the surface, if the gap is shorter than this fraction of the
-#: ring's length. Longer gaps belong to lines that end at the open end of a tube, so these lines are no rings.
+#: ring's length. Level lines with a longer gap end at the open end of a tube. They do not go around the tube, so they
+#: are no rings.
 _GAP = 0.25
 
 
@@ -73,7 +74,7 @@ class _Rings(NamedTuple):
     ring: np.ndarray  # (p,) number of the ring of each point
     closed: np.ndarray  # (r,) False for a line that does not go around the tube (`_GAP`)
     below: np.ndarray  # (r,) number of the band on the side of each ring with smaller distances
-    above: np.ndarray  # (r,) number of the band on the other side of each ring
+    above: np.ndarray  # (r,) number of the band on the side of each ring with larger distances
     band: np.ndarray  # (n,) number of the band of each corner
 
 
@@ -211,7 +212,7 @@ def _pieces(points: np.ndarray, r: _Rings) -> CentreLines | None:
             if own in others:
                 continue
             beside = real[side[real] == own]
-            # If other branches also meet or begin in this band, they are joined with this one. Otherwise this branch
+            # If other branches also meet or begin in this band, they are joined with this branch. Otherwise this branch
             # ends here.
             lines += [(centre[a], centre[b], np.isin(r.ring, (a, b))) for b in beside[beside > a]]
             if len(beside) > 1:
@@ -228,7 +229,7 @@ def _pieces(points: np.ndarray, r: _Rings) -> CentreLines | None:
 
 
 def _without_open_lines(r: _Rings, real: np.ndarray) -> tuple[_Rings, np.ndarray, np.ndarray]:
-    """Remove the lines that do not go around the tube. The bands on both sides of a removed line become one band.
+    """Remove the level lines that do not go around the tube. The bands on both sides of a removed line become one band.
     Return also the numbers of these bands."""
     import scipy.sparse
     from scipy.sparse.csgraph import connected_components
@@ -244,8 +245,9 @@ def _without_open_lines(r: _Rings, real: np.ndarray) -> tuple[_Rings, np.ndarray
 def _without_tips(r: _Rings, real: np.ndarray, open_ends: np.ndarray) -> tuple[_Rings, np.ndarray]:
     """Remove the last ring of each branch, since this ring may lie around a corner of the flat end of the tube.
 
-    The bands on both sides of a removed ring become one band. Next to a band of `open_ends` no ring is removed: there
-    the end of the tube is open, and lines around its corners do not go around the tube.
+    The bands on both sides of a removed ring become one band. Next to a band of `open_ends` no ring is removed: at an
+    open end, level lines around the corners do not go around the tube, so `_without_open_lines` has already removed
+    them.
     """
     keep, band, below, above = set(real.tolist()), r.band.copy(), r.below.copy(), r.above.copy()
     sides = np.concatenate([below[real], above[real]])
@@ -258,7 +260,7 @@ def _without_tips(r: _Rings, real: np.ndarray, open_ends: np.ndarray) -> tuple[_
 
 
 def _outwards(centre: np.ndarray, r: _Rings, real: np.ndarray, a: int, own: int) -> np.ndarray:
-    """Return the unit direction (3,) of the centre line from ring a, the last one of a branch, to the surface's end.
+    """Return the unit direction (3,) from ring a, the last ring of a branch, to the end of the surface.
 
     The direction is that from the previous ring to ring a. If there is no previous ring, it is the normal of ring a.
     """

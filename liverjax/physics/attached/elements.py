@@ -25,7 +25,10 @@ class Elements(NodalForce):
         raise TypeError(f"{type(self).__name__} must define nodes(mesh)")
 
     def tangents(self, mesh: TetMesh) -> jax.Array:
-        """Return the factors p_ka (d, n, Q, m) [1/m] of d tangent vectors and n nodes, at Q points of m elements."""
+        """Return the factors p_ka (d, n, Q, m) of d tangent vectors and n nodes, at Q points of m elements.
+
+        Their unit is 1/m (ligaments: no unit).
+        """
         raise TypeError(f"{type(self).__name__} must define tangents(mesh)")
 
     def energies(self, mesh: TetMesh, C: tuple[jax.Array, ...]) -> jax.Array:

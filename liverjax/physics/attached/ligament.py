@@ -1,9 +1,9 @@
 """A ligament: a cable between two points of the body, or from a set of nodes to a point outside the body.
 
-The tension at length l is k (l - l0), with the stiffness k and the rest length l0. It is 0 if the ligament is slack, so
-a ligament pulls and does not push. The user gives l0, or the tension T0 in the reference shape. With the length L in
-the reference shape, the rest length is l0 = L - T0/k. A ligament from n nodes to a point outside has n fibres, which
-share stiffness and tension equally.
+The tension at length l is k (l - l0), with the stiffness k and the rest length l0. The tension is 0 if the ligament is
+slack, so a ligament pulls and does not push. The user gives l0, or the tension T0 in the reference shape. With the
+length L in the reference shape, the rest length is l0 = L - T0/k. A ligament from n nodes to a point outside has n
+fibres, which share stiffness and tension equally.
 """
 
 from typing import Any, ClassVar
@@ -110,7 +110,7 @@ class Ligament(Physics):
         return Fibres(at=self.nodes, weights=self.weights, to=self.to, rest=rest, spring=self.stiffness / len(rest))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Return nodes (n,) and directions (n, 3) of the fibres to a point outside, if taut when a run begins."""
+        """Return nodes (n,) and directions (n, 3) of the fibres to a point outside, if taut in the reference shape."""
         if self.to is None:
             return np.zeros(0, int), np.zeros((0, 3))
         lengths, rest = map(np.asarray, _lengths_and_rest(self, mesh))
@@ -119,7 +119,7 @@ class Ligament(Physics):
         return np.asarray(self.nodes)[0, taut], f / lengths[taut, None]
 
     def is_tight(self, mesh: TetMesh) -> bool:
-        """Return whether a fibre has a tension in the reference shape; True if its numbers are unknown (as in jit)."""
+        """Return whether a fibre is under tension in the reference shape; True if numbers are unknown (inside jit)."""
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((self, mesh.points))):
             return True
         with jax.ensure_compile_time_eval():  # inside jit, jnp would make tracers of the known numbers too
@@ -131,7 +131,7 @@ class Ligament(Physics):
         return True
 
     def is_straight_without_tension(self, mesh: TetMesh, x: jax.Array) -> bool:
-        """Return whether a fibre has exactly its rest length at positions x (V, 3), so that its tension is 0.
+        """Return whether a fibre has its rest length, up to roundoff, at positions x (V, 3), so that its tension is 0.
 
         In a small vibration about x such a fibre would be slack half of the time.
         """

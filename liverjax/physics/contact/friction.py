@@ -52,7 +52,7 @@ class RoughObstacle(Obstacle):
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
         """Return the nodes of triangles that touch the obstacle at the beginning, and their constrained directions.
 
-        These are all three directions. If the friction coefficient is 0, only the normal is constrained.
+        All three directions are constrained. If the friction coefficient is 0, only the normal is constrained.
         """
         nodes, normals = super().holds(mesh)
         if not np.all(np.asarray(self.friction) > 0):
@@ -120,7 +120,7 @@ class Rubbing(Touching):
         return trial * jnp.where(size > most, most / size, 1.0)[None]
 
     def _law(self, at: jax.Array, s: Number) -> tuple[jax.Array, jax.Array]:
-        """Return the normals (3, Q, m) of the obstacle, and the maximum slip (Q, m) [m] at the present pressure."""
+        """Return the normals (3, Q, m) of the obstacle, and the maximum slip (Q, m) [m] at the current pressure."""
         d = distances(self.obstacle, at, self.now(s))
         return jnp.stack(d.normal), jnp.multiply(self.friction, jnp.maximum(-d.value, 0.0))
 
@@ -162,7 +162,7 @@ class Rubbing(Touching):
         return self.energy(mesh, x) + jnp.sum(weighted_stiffness(self.obstacle, mesh) * stored)
 
     def definite(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """Return the second derivative of `energy_from`.
+        """Return the second derivative of `energy_from` for `start` = x, without the change of the contact normals.
 
         A sliding point has no stiffness along its direction of sliding.
         """
@@ -186,9 +186,10 @@ class Rubbing(Touching):
 
 
 def _of_slip(trial: jax.Array) -> jax.Array:
-    """Return the lengths (Q, m) [m] of slips (3, Q, m). They are at least 1e-103, in single precision 2e-13.
+    """Return the lengths (Q, m) [m] of slips (3, Q, m). Each length is at least 2e-103, in single precision 2e-13.
 
-    The bound avoids a division by 0. The lengths to the power -3, which occur in second derivatives, do not overflow.
+    The bound avoids a division by 0. With this bound, the lengths to the power -3, which occur in second derivatives,
+    do not overflow.
     """
     least = float(jnp.finfo(trial.dtype).tiny) ** (2 / 3)
     return jnp.sqrt(jnp.maximum(jnp.sum(trial * trial, axis=0), least))

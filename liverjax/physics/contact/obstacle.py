@@ -36,8 +36,8 @@ from liverjax.physics.contact.passage import in_body
 from liverjax.physics.contact.shapes import SHAPES, Distance, distance
 from liverjax.solvers.attached import Attached
 
-#: Stiffness of the contact, divided by the stiffness of a layer of the body's material. The layer is as thick as a
-#: triangle is wide.
+#: Stiffness of the contact, divided by the stiffness of a layer of the body's material. The thickness of this layer is
+#: the size of a triangle.
 HARDNESS = 100.0
 #: A point counts as touching if its distance, divided by the size of a triangle, is at most `_TOUCHING`. In the
 #: reference shape, the limit is `_NEAR`: nodes of files in float32 have roundoff (see `reach_of_touch`).
@@ -166,13 +166,13 @@ class Obstacle(Physics):
     def in_body(self, mesh: TetMesh, law: Law) -> "Obstacle":
         """Return the obstacle with a default stiffness from the law, if the user gave no stiffness.
 
-        The default is `HARDNESS` times the modulus K + 4/3 mu of the element at the triangle, divided by the size of
-        the triangle. mu is the shear modulus. The bulk modulus K is limited to 3 mu.
+        The default is `HARDNESS` times the modulus K + 4/3 mu of the element at the triangle, divided by the square
+        root of the area of the triangle. mu is the shear modulus. The bulk modulus K is limited to 3 mu.
         """
         if self.stiffness is not None:
             return self
-        # Material under a contact can move sideways, so a large bulk modulus hardly stiffens it. Without the limit 3
-        # mu, the contact would be much stiffer than the material.
+        # Material under a contact can move sideways, so a large bulk modulus makes this material only slightly stiffer.
+        # Without the limit 3 mu, the contact would be much stiffer than the material.
         shear = law.shear_modulus()
         modulus = jnp.asarray(jnp.minimum(law.bulk_modulus(), 3 * shear) + 4 / 3 * shear)
         if modulus.ndim:  # the largest modulus of each element, if it has several points
@@ -195,7 +195,10 @@ class Obstacle(Physics):
         return zero if self.by is None else jnp.asarray(self.by) * (k / steps)
 
     def freeze(self, memory: None, step: Step) -> "Touching":
-        """Return the force term of a step. It stores the displacements of the obstacle at both ends of the step."""
+        """Return the force term of a step.
+
+        It stores the obstacle's displacements at the beginning and at the end of the step.
+        """
         dt = 0.0 if step.dt is None else step.dt
         moved = jnp.stack([self.displacement(n, step.steps, dt) for n in (step.k - 1, step.k)])
         # Newmark's method uses only the force at the end of the step, doubled (`liverjax.physics.inertia`).
@@ -415,7 +418,7 @@ def near_points(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) -> jax.Array:
 def _radius_and_width(obstacle: Obstacle, mesh: TetMesh) -> tuple[float, float]:
     """Return the radius [m] of the obstacle (at least a thousandth of the width), and the width [m].
 
-    The width is that of the largest triangle.
+    The width is the square root of the area of the largest triangle.
     """
     width = float(jnp.sqrt(jnp.max(_triangle_areas(obstacle, mesh))))
     return max(float(np.max(np.asarray(obstacle.radius))), 1e-3 * width), width

@@ -28,8 +28,8 @@ def in_body(
         mesh: mesh of the body.
         x: positions (V, 3) [m] of the nodes.
         centres: n positions (n, 3) [m] of the obstacle.
-        triangles: node numbers (m, 3) of the triangles that may touch the obstacle. Pieces of the mesh without such
-            triangles are ignored.
+        triangles: node numbers (m, 3) of the triangles that may touch the obstacle. Connected parts of the mesh without
+            such triangles are ignored.
     """
     found = np.zeros(len(centres), bool)
     if shape not in ("sphere", "cylinder"):
@@ -66,7 +66,8 @@ def passed_in_step(
 
     The obstacle went through if a position on its path is inside the body both at the beginning and at the end of the
     step. If the obstacle only leaves the body, the body fills the space behind it: positions there are inside only at
-    the end. If it pushes the body, the body moves away in front of it: positions there are inside only before the step.
+    the end. If it pushes the body, the body moves away in front of it: positions there are inside only at the
+    beginning.
 
     Args:
         positions: nodal positions (2, V, 3) [m] at the beginning and at the end of the step.

@@ -5,9 +5,9 @@ from the balance of forces,
 
     dE/dt(x, t) = F,
 
-with the size F of the force and the energy E of the contact at positions x. The elimination of t adds -h h^T / E_tt to
-the stiffness of the contact, with h = d2E/dx dt and E_tt = d2E/dt2. This dense matrix of rank one is not stored.
-Matrix-vector products add its effect, and a factorisation is corrected for it.
+with the magnitude F of the force and the energy E of the contact at positions x. The elimination of t adds -h h^T /
+E_tt to the stiffness of the contact, with h = d2E/dx dt and E_tt = d2E/dt2. This dense matrix of rank one is not
+stored. Matrix-vector products add its effect, and a factorisation is corrected for it.
 """
 
 from collections.abc import Callable, Mapping
@@ -138,8 +138,8 @@ class PressedObstacle(Obstacle):
     def freeze(self, memory: Any, step: Step) -> "Pressing":
         """Return the force term of a step.
 
-        It stores the magnitudes of the force at both ends of the step, and the displacement of the obstacle at the
-        beginning.
+        It stores the magnitudes of the force at the beginning and at the end of the step, and the displacement of the
+        obstacle at the beginning.
         """
         dt, dtype = 0.0 if step.dt is None else step.dt, step.x.dtype
         load = jnp.stack([jnp.asarray(self.load(n, step.steps, dt), dtype) for n in (step.k - 1, step.k)])
@@ -189,7 +189,10 @@ class Pressing(Touching):
         return self.travel(self.points(x), s) * self.direction
 
     def travel(self, at: jax.Array, s: Number) -> jax.Array:
-        """Return the displacement () [m] along the force at which the contact balances it; NaN if none is found."""
+        """Return the displacement () [m] of the obstacle along its force for which the contact balances this force.
+
+        The result is NaN if no such displacement is found.
+        """
         load = self.load[0] + s * (self.load[1] - self.load[0])
         found = self._found(*jax.lax.stop_gradient((at, load)))
         # Newton steps that begin at the solution do not change its value, but they give its derivatives: one step gives
@@ -256,7 +259,7 @@ class Pressing(Touching):
     def gives_way(self, mesh: TetMesh, x: jax.Array, s: Number, definite: bool) -> GivesWay:
         """Return the loss of stiffness due to the free displacement of the obstacle along its force.
 
-        If `definite` is true, the change of the normals is ignored, as in the method `definite` of the contact.
+        If `definite` is true, the change of the normals is ignored, as in `Touching.definite`.
         """
         at = self.points(x)
         d = distances(self.obstacle, at, self.travel(at, s) * self.direction)

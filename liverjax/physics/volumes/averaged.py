@@ -70,7 +70,7 @@ def averaged_pressure(mesh: TetMesh, law: Law, J: jax.Array) -> jax.Array:
 
 
 def compliance(mesh: TetMesh, law: Law, J: jax.Array, positive: bool) -> BlockMatrix:
-    """Return the diagonal matrix D of entries V_a/U'' [m^3/Pa], or of their absolute values if `positive` is true."""
+    """Return the diagonal matrix D with entries V_a/U'' [m^3/Pa], or their absolute values if `positive` is true."""
     U = volumetric_part(law)
     mean, volumes = _mean(mesh, J)
     slope = U.energy_derivatives(_invariants(U, mean))[1]["J", "J"]
@@ -107,7 +107,7 @@ class Averaged(VolumeStress):
     def scalars(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Scalars:
         """Return the pressure [Pa] in the elements, and its derivative with respect to J, which is 0.
 
-        The pressures at the nodes are constant in this derivative.
+        This derivative is taken at constant nodal pressures.
         """
         p = interpolated(mesh, pressure)
         return Scalars({"J": p}, {("J", "J"): jnp.zeros_like(p)})
@@ -117,7 +117,7 @@ class Averaged(VolumeStress):
         return energy(mesh, self.law, J)
 
     def density(self, mesh: TetMesh, pressure: jax.Array, J: jax.Array) -> jax.Array:
-        """Return the volumetric energy density (E,) [J/m^3]: the means of the densities at the corners."""
+        """Return the volumetric energy density (E,) [J/m^3]: the mean of the densities at the corners."""
         U = volumetric_part(self.law)
         return interpolated(mesh, U.strain_energy(_invariants(U, _mean(mesh, J)[0])))
 

@@ -1,16 +1,16 @@
-"""Pressures as unknowns against volumetric locking: Taylor-Hood (P2/P1) for quadratic elements, P1/P1 for linear ones.
+"""Pressures as unknowns against volumetric locking: Taylor-Hood (P2/P1) in quadratic and P1/P1 in linear elements.
 
 The volumetric energy is U(J) = K g(J)^2 / 2, with the bulk modulus K and the volumetric strain g of the volume ratio J.
 With pressures p the energy per volume is
 
     W_isochoric + gamma g^2 / 2 + p g - p^2 / (2 (K - gamma)),
 
-with p linear in every element and continuous. At the p for which this energy is stationary, it consists of gamma g^2/2
-and (K - gamma) g^2/2, with g in the second term averaged by the shape functions of p. So a large K limits volume
-changes only on average, not at every point. The part gamma of the bulk modulus stays in the terms of the displacements,
-so that their matrix is positive definite. gamma is min(mu, K/2) with the shear modulus mu, and a quarter of this in
-linear elements. The finer the mesh, the less the solution depends on gamma. Pressures and positions are unknowns of the
-same system. If the pressures were eliminated, Newton's method would not converge for large K.
+with p linear in every element and continuous. If this energy is stationary with respect to p, its volumetric part is
+gamma g^2/2 + (K - gamma) h^2/2, where h is the projection of g onto the shape functions of p. So a large K limits
+volume changes only on average, not at every point. The part gamma of the bulk modulus stays in the displacement terms,
+so that the displacement matrix is positive definite. gamma is min(mu, K/2) with the shear modulus mu, and a quarter of
+this in linear elements. The finer the mesh, the less the solution depends on gamma. Pressures and positions are
+unknowns of the same system. If the pressures were eliminated, Newton's method would not converge for large K.
 
 In linear elements, the positions do not determine all pressures: some pressures that alternate from node to node cause
 no force. For large K these pressures would grow without bound. So linear elements have a stabilisation term, - (p -
@@ -42,8 +42,8 @@ def check_mixed_laws(several: Sequence[Law], name: str = "[solve] volumetric = '
     """Check that pressures can be unknowns with the laws of a body.
 
     Raises:
-        InputError: a law has no isochoric part, no volumetric part, no shear modulus or no bulk modulus, or is
-            continued below a volume ratio, or the laws have different kinds of volumetric energy.
+        InputError: a law has no isochoric part, no volumetric part, no shear modulus or no bulk modulus; a law is
+            continued below a volume ratio; or the laws have different kinds of volumetric energy.
     """
     kinds = set()
     for law in several:
@@ -78,7 +78,7 @@ def strain(kind: str, J: jax.Array) -> jax.Array:
     d = J - 1
     if kind == "quadratic":
         return d
-    # g^2 = (J^2 - 1 - 2 ln J) / 2 = d^2 (1 + sum_n (-1)^n d^(n-2) / n, n = 3 …). Near J = 1, the first form loses
+    # g^2 = (J^2 - 1 - 2 ln J) / 2 = d^2 (1 + sum_n (-1)^n d^(n-2) / n, n = 3 …). Near J = 1, the first expression loses
     # digits by roundoff.
     near = jnp.clip(d, -0.1, 0.1)
     series = 1 + sum((-1) ** n * near ** (n - 2) / n for n in range(3, 18))
@@ -161,14 +161,14 @@ class Mixed(VolumeStress):
         return scale_matrix((self.part * g + interpolated(mesh, pressure)) * g1, cofactor(F))
 
     def energy(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
-        """Return the energy [J] at volume ratios J and pressures p of `settled`: integral of gamma g^2/2 + p g/2."""
+        """Return the energy [J] at volume ratios J and pressures p from `settled`: integral of gamma g^2/2 + p g/2."""
         g = strain(self.kind, J)
         return jnp.sum(mesh.weights * (0.5 * self.part * g * g)) + 0.5 * jnp.vdot(
             self.settled(mesh, J), integrals(mesh, g)
         )
 
     def density(self, mesh: TetMesh, pressure: jax.Array, J: jax.Array) -> jax.Array:
-        """Return the volumetric energy density [J/m^3], gamma g^2/2 + p g/2, at pressures p (V,) of `settled`."""
+        """Return the volumetric energy density [J/m^3], gamma g^2/2 + p g/2, at pressures p (V,) from `settled`."""
         g = strain(self.kind, J)
         return 0.5 * g * (self.part * g + interpolated(mesh, pressure))
 
@@ -185,13 +185,13 @@ class Mixed(VolumeStress):
     def balance(self, mesh: TetMesh, pressure: jax.Array, J: jax.Array) -> jax.Array:
         """Return the residual (V,) [m^3] of the pressure equation, which is 0 at a solution.
 
-        It contains the integrals of the shape functions of p times g - p/(K - gamma). In linear elements, the
+        It contains the integrals of N (g - p/(K - gamma)), with the shape functions N of p. In linear elements, the
         stabilisation term is subtracted.
         """
         return integrals(mesh, strain(self.kind, J)) - self.compliance(mesh, pressure)
 
     def compliance(self, mesh: TetMesh, pressure: jax.Array) -> jax.Array:
-        """Return the integrals (V,) [m^3] of the shape functions of p times p/(K - gamma).
+        """Return the integrals (V,) [m^3] of N p/(K - gamma), with the shape functions N of p.
 
         In linear elements, the stabilisation term is added.
         """
@@ -239,6 +239,6 @@ class Mixed(VolumeStress):
         return BlockMatrix(rows, ((given(zero, mesh.tetrahedra.T, own),),), mesh.pattern.row_nodes)
 
     def schur(self, mesh: TetMesh) -> jax.Array:
-        """Return a diagonal approximation (V,) [m^3/Pa] of the pressure matrix after the elimination of positions."""
+        """Return a diagonal approximation (V,) [m^3/Pa] of the Schur complement for the pressures."""
         soft = 1 / (1.5 * self.shear + self.part) + 1 / self.rest
         return integrals(mesh, jnp.broadcast_to(soft, mesh.weights.shape))
