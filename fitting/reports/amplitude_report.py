@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 def write(out: Path, sweep: StrainSweep, fits: list[StrainFit], warnings: Sequence[str] = ()) -> Content:
     """Write fit.json and fit.png into the existing folder `out`, and return the content of fit.json. `fits` begins with
-    the best fit. `warnings` are written before the warnings of the fits.
+    the best fit. `warnings`: sentences that fit.json lists before the warnings about the fits.
     """
     content = {
         "error_is": "mean_relative_error: root mean square of the misfits of G' and G'', both divided by |G*|. "
@@ -58,8 +58,8 @@ def table(sweep: StrainSweep, fits: list[StrainFit]) -> str:
 
 
 def figure(sweep: StrainSweep, fits: list[StrainFit]) -> "Figure":
-    """Plot the moduli over strain with the best laws (left), and the third harmonics that these laws predict
-    (right)."""
+    """Plot the measured moduli and the moduli of the best laws over the strain (left), and the third harmonics that
+    these laws predict (right)."""
     fig = pyplot().figure(figsize=(10, 4.2), layout="constrained")
     left, right = fig.subplots(1, 2)
     percent = 100 * sweep.strain

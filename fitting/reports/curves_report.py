@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 #: Number of points at which the fitted stress of a curve is drawn.
 FINE = 200
-#: Function for the stresses of a law on all curves of a figure. The function is compiled once for each kind of law,
-#: because all laws of a figure are evaluated at the same points.
+#: Function that computes the stresses of a law at the points of all curves of a figure. The function is compiled once
+#: for each kind of law, because all laws of a figure are evaluated at the same points.
 _stress = jax.jit(partial(homogeneous.nominal_stress, constant=True))
 
 
@@ -112,7 +112,8 @@ def figure(curves: list[Curve], ordered: list[LawFit]) -> "Figure":
 
 
 def fine(curve: Curve) -> Curve:
-    """Return the deformations of a curve at `FINE` points along the curve, with a stress of zero.
+    """Return the curve with `FINE` interpolated deformations, at which fitted stresses are drawn. All stresses of the
+    returned curve are 0.
 
     Between two measured points, the shears and the logarithms of the diagonal of F change linearly. So in a tension
     test the lateral stretch stays lambda^(-1/2). F33 is scaled so that det F = 1.
@@ -141,8 +142,8 @@ def _curve(axis: Any, curve: Curve, dense: Curve, stresses: list[np.ndarray]) ->
 
 
 def table(fits: list[LawFit]) -> str:
-    """Return a table with one line per law, best law first: error, times of running and compiling, Akaike's criterion,
-    G0, and parameters ± standard error."""
+    """Return a table with one line per law, best law first: error, run time, compile time, Akaike's criterion, G0, and
+    parameters ± standard error."""
     lines = [f"{'law':18s} {'error':>7s} {'run':>8s} {'compile':>8s} {'AICc':>8s}  G0 [Pa]    parameters"]
     for f in best_first(fits):
         parameters = ", ".join(

@@ -112,13 +112,14 @@ def of_numbers(found: Estimate, with_mesh: bool = False) -> Content:
 
 
 def _mapped(mesh: TetMesh, found: Field) -> np.ndarray:
-    """Return the indices of the nodes with a value of the map: the nodes of all elements whose parameter is not given
-    by a [[region]]."""
+    """Return the indices of the nodes at which the map has a value: the nodes of all elements whose parameter is not
+    given by a [[region]]."""
     return np.unique(mesh.element_nodes_on_host[:, ~found.given])
 
 
 def _where_mapped(mesh: TetMesh, found: Field) -> Field:
-    """Return the field with the standard deviations and the biases of only the mapped vertices (see `_mapped`)."""
+    """Return a copy of `found` in which the standard deviations and the biases contain only the mapped vertices (see
+    `_mapped`)."""
     mapped = _mapped(mesh, found)
     mapped = mapped[mapped < len(found.sd)]
     of_mesh, of_steps = (None if b is None else b[mapped] for b in (found.mesh_bias, found.time_step_bias))
@@ -194,13 +195,13 @@ def section(mesh: TetMesh, values: np.ndarray, middle: np.ndarray, axis: int, n:
 
 
 def map_figure(mesh: TetMesh, found: Field) -> "Figure":
-    """Plot sections through the node whose value is farthest from the median: the factor that multiplies the parameter
-    of the scene, and the uncertainty of this factor."""
+    """Plot three sections of the factor that multiplies the parameter of the scene, and three of the standard deviation
+    of its logarithm. The sections pass through the node at which the logarithm is farthest from its median."""
     shown = np.isin(np.arange(len(found.sd)), _mapped(mesh, found))
     factor, sd = (np.where(shown, values, np.nan) for values in (np.exp(found.log_factor), found.sd))
     middle = np.asarray(mesh.points)[np.nanargmax(np.abs(np.log(factor) - np.nanmedian(np.log(factor))))]
     figure, axes = pyplot().subplots(2, 3, figsize=(11, 5.5), layout="constrained")
-    # The digits of a place [cm] are three or more of the size of the body.
+    # With this number of decimals, the size of the body [cm] has three or more significant digits.
     digits = max(1, 2 - int(np.floor(np.log10(100 * np.ptp(mesh.points, axis=0).max()))))
     rows = (
         (factor, f"{found.name} over the scene's [1]", "viridis"),

@@ -2,8 +2,8 @@
 
 All cards contain a neo-Hookean law. Its shear modulus is the instantaneous modulus G0; only the card for SOFA, which
 has no Prony series, contains the equilibrium modulus. If the equilibrium modulus cannot be distinguished from zero (a
-fluid), the card for SOFA contains G0. The whole stress relaxes, as in the simulations here (part = "all"). A shear
-test does not determine the bulk modulus. The bulk modulus is computed from Poisson's ratio `POISSON`.
+fluid), the card for SOFA contains G0. The whole stress relaxes, as in the simulations of liverjax with part = "all". A
+shear test does not determine the bulk modulus. The bulk modulus is computed from Poisson's ratio `POISSON`.
 """
 
 from pathlib import Path
@@ -25,8 +25,8 @@ _DISTINCT = 2.0
 
 
 def write(folder: Path, model: Maxwell, equilibrium_error: float = 0.0) -> list[str]:
-    """Write all cards into `folder`. Return notes on everything that a program cannot represent. `equilibrium_error`:
-    standard error [Pa] of the equilibrium modulus."""
+    """Write all cards into `folder`. Return notes on every property that one of the programs cannot represent.
+    `equilibrium_error`: standard error [Pa] of the equilibrium modulus."""
     folder.mkdir(parents=True, exist_ok=True)
     told = []
     if len(model.ratios) > FEBIO_TERMS:
@@ -57,7 +57,8 @@ def write(folder: Path, model: Maxwell, equilibrium_error: float = 0.0) -> list[
 
 
 def _is_solid(model: Maxwell, equilibrium_error: float) -> bool:
-    """Return whether the equilibrium modulus can be distinguished from zero. Its standard error is given in Pa."""
+    """Return whether the equilibrium modulus can be distinguished from zero. `equilibrium_error`: its standard error
+    [Pa]."""
     smallest = (1 - LARGEST_SUM) * float(model.shear_modulus)
     return equilibrium_of(model) > max(smallest, _DISTINCT * equilibrium_error)
 
@@ -77,7 +78,8 @@ def _written_number(value: float) -> str:
 
 
 def _below_one(ratios: np.ndarray) -> np.ndarray:
-    """Return the ratios. The ratios of a fluid are reduced so that a millionth of G0 does not relax."""
+    """Return the ratios. If their sum exceeds `LARGEST_SUM` (a fluid), they are reduced to this sum, so that a
+    millionth of G0 does not relax."""
     return np.asarray(ratios) * min(1.0, LARGEST_SUM / max(float(np.sum(ratios)), 1e-300))
 
 

@@ -22,7 +22,7 @@ CHARACTERS, SIZE = 104, 8.0
 
 
 def write(file: Path, sweep: Sweep, fits: list[Fit], content: Content, first: str = "") -> None:
-    """Write the page as PDF, or in another format that the ending of the file name shows.
+    """Write the page into `file`. The suffix of the file name determines the format (.pdf for PDF).
 
     Args:
         sweep, fits: see `sweep_report.write`.

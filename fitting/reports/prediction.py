@@ -32,7 +32,7 @@ class Prediction(NamedTuple):
     sizes: np.ndarray  # (m,) relative error = |predicted - measured| / sizes; infinite if a value does not count
     inside: np.ndarray  # (m,) whether the point is in the band of the fitted sweep, see `_in_band`
     noise: np.ndarray  # (m,) noise of the measured values, divided by `scales`; NaN: too few values to estimate it
-    quantile: float  # half width of the 95 % interval of the fit, divided by its standard error
+    quantile: float  # half width of a 95 % interval of the fit, divided by the standard error
 
     @property
     def relative_errors(self) -> np.ndarray:
@@ -41,13 +41,13 @@ class Prediction(NamedTuple):
 
     @property
     def counted(self) -> np.ndarray:
-        """Whether the point is in the band and has not decayed into the noise (m,)."""
+        """Whether each value is in the band of the sweep and has not decayed into the noise (m,)."""
         return self.inside & np.isfinite(self.sizes)
 
     @property
     def factor(self) -> float:
-        """Factor by which the prediction must be multiplied to fit the test best. With another sample or another
-        strain, all values often differ by one factor."""
+        """Factor by which the prediction must be multiplied to fit the test best. In a test of another sample or at
+        another strain, all values often differ from the prediction by the same factor."""
         y, p = (v[self.inside] / self.scales[self.inside] for v in (self.measured, self.predicted))
         return float(p @ y / (p @ p))
 
@@ -94,11 +94,12 @@ def predict(fit: Fit, resolved: tuple[float, float], test: Measured) -> Predicti
 
 
 def _in_band(test: Measured, resolved: tuple[float, float], count: int) -> np.ndarray:
-    """Return whether each of the `count` values (m,) of a test depends only on resolved relaxation times.
+    """Return for each of the `count` values (m,) of a test whether the value depends only on resolved relaxation times.
 
-    In a relaxation or creep test, the load must have changed last at least the shortest of these times ago, and must
-    have begun at most the longest of these times ago. In a cyclic test, the load may have begun earlier, if it never
-    went on for more than the longest of these times without a change (`TimeTest.since_change`)."""
+    In a relaxation or creep test, this needs two conditions. First, since the last change of the load, at least the
+    shortest of these times has passed (`TimeTest.since_change`). Second, since the beginning of the load, at most the
+    longest of these times has passed. In a cyclic test, a weaker second condition is enough: up to the time of this
+    value, no interval without a change of the load was longer than the longest of these times."""
     low, high = resolved[0] * (1 - 1e-9), resolved[1] * (1 + 1e-9)
     if not isinstance(test, TimeTest):
         omega = np.asarray(reported_numbers(test)[0][0])
@@ -114,10 +115,11 @@ def _in_band(test: Measured, resolved: tuple[float, float], count: int) -> np.nd
 def _scatter_around(off: np.ndarray, inside: np.ndarray, test: Measured) -> np.ndarray:
     """Return the noise (s, k) of the values of a test with s series (`series_of`), divided by the scales.
 
-    It is estimated from the differences `off` (s, k) between prediction and test: for each series if four values or
-    more are `inside` (s, k) the band, and otherwise from the second differences of all series together. If there are
-    fewer than two second differences in the band, the values outside are used too. NaN for fewer than four values
-    without deviations."""
+    `off` (s, k): prediction minus test, divided by the scales. `inside` (s, k): whether a value is in the band. If
+    every series has four values or more in the band, the noise of each series is estimated from these values.
+    Otherwise, all series get one noise, from the second differences of the values in the band. If there are fewer than
+    two second differences, the values outside the band are used too, and a series with fewer than four values gets NaN.
+    In a sweep with measured standard deviations, the noise is at least 1 (also instead of NaN)."""
     rows = [own[counted] for own, counted in zip(off, inside, strict=True)]
     bends = np.concatenate([np.diff(row, 2) for row in rows])
     fewest = min(map(len, rows))

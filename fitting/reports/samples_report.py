@@ -66,8 +66,8 @@ def _json_content(found: Samples) -> Content:
 
 
 def _times_of_strengths(found: Samples) -> Content:
-    """Return the relaxation time [s] of each strength of a spectrum, by the name of the strength, and the number of
-    relaxation times per decade."""
+    """Return a dictionary that gives the relaxation time [s] for the name of each strength of a spectrum, and the
+    number of relaxation times per decade."""
     out: Content = {}
     for fit in found.fits:
         names = (n for n in fit.kind.names if n.startswith("strengths["))
@@ -101,7 +101,8 @@ def _population(p: Any) -> Content | None:
 
 
 def _sample_entry(found: Samples, k: int) -> Content:
-    """Return the separate fit of one sample, and its parameters shrunk towards the population mean (pooled)."""
+    """Return the separate fit of sample `k`, and the sample's parameters after shrinkage towards the population mean
+    (pooled)."""
     fit, sweep = found.fits[k], found.sweeps[k]
     pooled = {
         name: {"value": p.pooled[k], "standard_deviation_of_logarithm": p.pooled_errors[k]}
@@ -112,7 +113,8 @@ def _sample_entry(found: Samples, k: int) -> Content:
     return summary(fit, sweep) | {"band_sensitivity": band_sensitivity(fit), "total_errors": whole} | more
 
 
-#: Words in the warnings of single samples, and the sentence of the summary that counts these warnings.
+#: Pairs of texts: words that occur in a warning about a single sample, and what the summary says about all samples that
+#: have this warning.
 COUNTED = (
     ("mark of the instrument", "the instrument dominates the last points"),
     ("not corrected", "an error of the instrument's inertia is not corrected"),
@@ -184,7 +186,7 @@ def warnings(found: Samples) -> list[str]:
 
 
 #: A warning is given if the equilibrium modulus of the typical sample's Prony modes differs from the population mean by
-#: more than this (relative).
+#: more than this fraction.
 APART = 0.01
 
 

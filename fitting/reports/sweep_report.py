@@ -131,7 +131,7 @@ def band_sensitivity(fit: Fit) -> Content:
 
 
 def by_stem(flat: dict[str, float]) -> Content:
-    """Return values under the same names as in `standard_errors`: one list for ratios[0], ratios[1], …"""
+    """Return values under the same names as in `standard_errors`: ratios[0], ratios[1], … become one list `ratios`."""
     out: Content = {}
     for name, value in flat.items():
         stem = name.split("[")[0]
@@ -151,7 +151,7 @@ def own_numbers(p: Estimate | None, kind: Kind) -> Content:
 
 
 def spectrum_rows(details: Content) -> list[str]:
-    """Return lines to print about the relaxation spectrum of a fit. There are no lines if the model is no spectrum."""
+    """Return lines to print about the relaxation spectrum of a fit, or an empty list for other models."""
     found = details.get("spectrum")
     if not found:
         return []
@@ -238,7 +238,7 @@ def _store(path: Path, sweep: Sweep, fits: list[Fit], content: Content) -> None:
 def figure(sweep: Sweep, fits: list[Fit]) -> "Figure":
     """Plot moduli and residuals (left); time constants and the table of parameters (right).
 
-    Lengths are in inches. The picture grows with the table, so no panel shrinks and no line is cut off.
+    Lengths are in inches. A longer table makes the picture higher, so no panel shrinks and no line is cut off.
     """
     fit = fits[-1]
     lines = _parameter_rows(fit)
@@ -273,7 +273,7 @@ def _nearest_of_all(fits: list[Fit]) -> str:
 
 
 def draw_moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
-    """Draw the data, the closed form (a line) and the simulation on `top`, and the relative differences on `rest`."""
+    """Draw data, closed form (a line) and simulation on `top`, and the relative deviation of the fit on `rest`."""
     fit, closed = fits[-1], fits[0]
     f = sweep.angular_frequency / (2 * np.pi)
     fine = np.geomspace(f[0], f[-1], 400)
@@ -371,7 +371,7 @@ def draw_time_constants(axes: Any, sweep: Sweep, fits: list[Fit], columns: int =
 
 
 def _parameter_rows(fit: Fit) -> list[str]:
-    """Return lines with the moduli and one line per mode. For other models, return lines with the parameters."""
+    """Return lines with the moduli and one line per mode, or with the parameters of a model without Prony modes."""
     u, n = fit.uncertainty, fit.modes
     if fit.parameters is not None:
         return own_rows(fit.parameters, fit.kind, fit.details, edges.moved(fit))
@@ -470,7 +470,7 @@ def _totals(fit: Fit) -> list[str]:
 
 
 def _compression(fits: list[Fit]) -> list[str]:
-    """Return lines with the compression of the sample and the predicted axial force (none if it is not compressed)."""
+    """Return lines with the compression of the sample and the predicted axial force; no lines without compression."""
     found = [fit.details["precompression"] for fit in fits if "precompression" in fit.details]
     if not found:
         return []

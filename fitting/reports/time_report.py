@@ -76,7 +76,7 @@ def write(out: Path, test: TimeTest, fit: TimeFit, posterior: Posterior | None =
 
 
 def _total_errors_in_time(fit: TimeFit) -> Content:
-    """Return total errors and the contribution of each source (noise, size of the sample, short and long times). The
+    """Return the total errors, and the contribution of each source of errors (see `total_error.error_shares`). The
     result is empty for a test that a TOML file describes."""
     if "geometry_error" not in fit.details:
         return {}
@@ -88,7 +88,8 @@ def _total_errors_in_time(fit: TimeFit) -> Content:
 
 
 def table(test: TimeTest, fit: TimeFit) -> str:
-    """Return a table of parameters ± standard error, and the criterion of each model and number of modes tried."""
+    """Return a table of parameters ± standard error, and the criterion of each model that was tried, with its number of
+    modes."""
     rows = [f"{test.kind}, {fit.kind.name}{'' if fit.converged else ' (not converged)'}"]
     if time_tests.ELASTIC in fit.details:
         elastic = fit.details[time_tests.ELASTIC]

@@ -44,9 +44,10 @@ def write(out: Path, found: Together, relative: float | np.ndarray, density: flo
     Args:
         out: folder.
         found: the fit.
-        relative: relative errors (K,) of the moduli of the K tests due to the sizes of their samples, common to all
-            moduli of a test; or one number for all tests.
-        density: density of the material [kg/m^3]; None: the density of the shear waves among the tests, if any.
+        relative: relative errors (K,) of the moduli of the K tests due to the errors of the sample sizes; or one number
+            for all tests. Each error is common to all moduli of its test.
+        density: density of the material [kg/m^3]; None: the density that belongs to the first test of shear waves, if
+            there is such a test.
     """
     out.mkdir(parents=True, exist_ok=True)
     u, n = found.uncertainty, found.modes

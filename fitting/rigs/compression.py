@@ -32,8 +32,9 @@ from liverjax.laws import Law
 LARGEST = 0.5
 #: Maximum strain of one load step.
 _STEP = 0.05
-#: Lower ends of the search for the radial stretch, divided by 1 or by the stretch at constant volume. The second end is
-#: used if the first is too high, which happens if Poisson's ratio is small.
+#: Lower ends of the interval that is searched for the radial stretch, divided by the smaller of 1 and the radial
+#: stretch at constant volume. The second end is used if the first is too high, which happens if Poisson's ratio is
+#: small.
 _LOWER_ENDS = (0.9, 0.5)
 
 
@@ -119,8 +120,9 @@ def torsional_density(law: Law, strain: float, density: float) -> float:
     """Return the density [kg/m^3] with which `fitting.fits.sample_inertia` gives the right inertia of a compressed
     sample. That module uses the gap and the moduli that the instrument reports.
 
-    The compressed cylinder has the radius a R, the density rho / (a^2 l) and a modulus G. The instrument reports a^4 G.
-    The wave number omega sqrt(rho / (a^2 l G)) equals omega sqrt(rho a^2 / (l a^4 G)). So the density is rho a^2 / l.
+    The compressed cylinder has the radius a R (R: radius of the plates), the density rho / (a^2 l) and a modulus G. The
+    instrument reports a^4 G. The wave number omega sqrt(rho / (a^2 l G)) equals omega sqrt(rho a^2 / (l a^4 G)). So the
+    density is rho a^2 / l.
     """
     return density if strain == 0 else density * side_stretch(law, strain) ** 2 / (1 - strain)
 

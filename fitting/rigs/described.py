@@ -4,13 +4,13 @@ A small TOML file describes the test, the sample and its rig (the test machine).
 of unit shear modulus at a displacement d. For glued samples, f(d) is computed by finite elements and corrected for the
 estimated error of the mesh. In a slender sample, the stretch is taken as uniform. For indenters, f(d) is the exact
 solution for a layer that is bonded to a rigid base. The force on the viscoelastic sample follows from linear
-viscoelasticity with f(d) in place of the strain and the relaxation modulus G:
+viscoelasticity with the relaxation modulus G. Here f(d) takes the place of the strain:
 
     F(t) = integral of G(t - s) d f(d(s)).
 
 This formula is exact if strains are small, and if the bulk modulus relaxes like the shear modulus or is much larger
-than it. For an indenter, the formula is valid only while the contact grows (Lee and Radok 1960, J. Appl. Mech. 27:438).
-At large strain, the formula is an approximation: Fung's quasi-linear viscoelasticity.
+than the shear modulus. For an indenter, the formula is valid only while the contact grows (Lee and Radok 1960, J. Appl.
+Mech. 27:438). At large strain, the formula is an approximation: Fung's quasi-linear viscoelasticity.
 """
 
 import tomllib
@@ -61,14 +61,15 @@ _BACK = 0.02
 #: of a row, times _FALL for a median over _ROWS rows. For a median over more rows, the limit is _FALL_WIDE times this
 #: deviation, divided by the root of the number of rows. The values were found with simulated scatter.
 _ROWS, _FALL, _FALL_WIDE = 5, 1.5, 3.0
-#: The median over more rows covers at most the fraction _WIDE of the rows, and at most _WIDEST rows.
+#: The median over more rows covers at most the fraction _WIDE of all rows, and at most _WIDEST rows.
 _WIDE, _WIDEST = 0.05, 500
 #: A punch that goes back has lost the contact if its force is below AT_REST times the largest force, or below
 #: _NO_FORCE standard deviations of the noise of the force.
 _NO_FORCE = 3.0
-#: Its depth, relative to the largest one, must also exceed _DEEP times the relative limit of the force, or _DEEPEST.
+#: The depth of this punch must also exceed a fraction of its largest depth. This fraction is _DEEP times the limit of
+#: the force, divided by the largest force, but at most _DEEPEST.
 _DEEP, _DEEPEST = 5.0, 0.5
-#: Rows in which the force exceeds this fraction of the largest force show the direction of an indentation.
+#: The direction of an indentation is found from the rows in which the force exceeds this fraction of the largest force.
 _PRESSED = 0.5
 #: Minimum number of rows in which the contact grows, including the row at rest.
 _FEWEST = 6
@@ -76,15 +77,14 @@ _FEWEST = 6
 _MOST_ROWS = 2000
 #: Relative change of a size of the sample, for derivatives with respect to this size.
 _STEP = 0.01
-#: Glued samples are simulated up to this ratio of height to radius. Above this ratio, meshes are large and a run takes
-#: minutes, and the stretch is taken as uniform.
+#: Glued samples are simulated up to this ratio of height to radius. Above this ratio, a simulation would need a large
+#: mesh and take minutes, so the stretch is taken as uniform.
 _SLENDER = 10.0
-#: The glued ends make a slender sample stiffer. The stiffness is that of a sample that is shorter by this many radii,
-#: times the square of twice Poisson's ratio. With this value, the stiffness is within 0.2 % of that of simulated
-#: samples of 10 and 25 radii.
+#: The glued ends make a slender sample stiffer. Its stiffness is that of a sample with frictionless ends that is
+#: shorter by this number times (2 nu)^2 radii (nu: Poisson's ratio). With this value, the stiffness is within 0.2 % of
+#: that of simulated samples of 10 and 25 radii.
 _SHORTER = 0.325
-#: A glued sample is also computed against the direction of its load if it moves there by more than this fraction of its
-#: height.
+#: Displacements of a glued sample against its load are only computed if they exceed this fraction of the height.
 _REVERSED = 0.02
 #: A note is given if the relative deviation of the force from a straight line exceeds this value.
 _CURVED = 0.02
@@ -104,8 +104,8 @@ class Described(NamedTuple):
 
 def read_described(path: str | Path) -> TimeTest:
     """Read the described test and convert it to a test in shear, with the strain f(d)/S and the stress F/S. F is the
-    measured force. The area S is chosen so that a small strain equals d divided by a length of the sample. For sphere
-    and cone, this holds for the largest strain instead.
+    measured force. The area S is chosen so that a small strain equals d divided by the height or thickness of the
+    sample. For sphere and cone, this is so for the largest strain instead.
 
     Args:
         path: TOML file with the keys test, data (file with a table of time, displacement and force), and the sizes in
@@ -159,9 +159,9 @@ def read_described(path: str | Path) -> TimeTest:
 
 
 def _sign_of_load(described: Described, d: np.ndarray, force: np.ndarray) -> float:
-    """Return the sign (1 or -1) of the displacement d (n,) that loads the sample. Before the contact, an indenter may
-    move further than it moves in the sample. So only the rows with a large force count for an indenter. If these are
-    all rows, or rows without a displacement, the force before the first movement is taken as an offset."""
+    """Return the sign (1 or -1) of the displacement d (n,) that loads the sample. An indenter may move further before
+    the contact than in the sample. So for an indenter, only rows with a large force count. If these are all rows, or
+    have no displacement, the force before the first movement is subtracted as an offset."""
     pressed = 0.0
     if "thickness" in described.sizes:
         still = int(np.argmax(np.abs(d - d[0]) > AT_REST * np.ptp(d)))
@@ -174,8 +174,8 @@ def _sign_of_load(described: Described, d: np.ndarray, force: np.ndarray) -> flo
 
 
 def _from_contact(d: np.ndarray, sign: float, largest: float) -> np.ndarray:
-    """Return the displacements d (n,) of an indenter with 0 in the rows before contact. The scatter of d around 0 is no
-    approach and is not changed, because its mean without the negative values would not be 0."""
+    """Return the displacements d (n,) of an indenter, with 0 in the rows before contact. If the negative values of d
+    are only scatter around 0, d is not changed, because the mean of the scatter must stay 0."""
     approach = -float(np.min(sign * d))
     if approach <= max(AT_REST * largest, BEYOND_NOISE * noise_of_series(d)):
         return d
@@ -185,9 +185,9 @@ def _from_contact(d: np.ndarray, sign: float, largest: float) -> np.ndarray:
 def _rows_to_fit(
     described: Described, rows: tuple[np.ndarray, np.ndarray, np.ndarray], sign: float
 ) -> tuple[tuple[np.ndarray, ...], list[str]]:
-    """Return time, displacement and force of the rows that are fitted, and notes. The imposed quantity has no scatter.
-    For sphere and cone, rows are left out after the indenter goes back, and rows are added between the others. For a
-    punch, rows are left out after it loses the contact.
+    """Return time, displacement and force of the fitted rows, and notes. The scatter of the imposed quantity is
+    removed. For sphere and cone, rows after the indenter goes back are left out. If the displacement is imposed, rows
+    are added for sphere and cone, and rows after a punch loses the contact are left out.
 
     Args:
         described: the description of the test.
@@ -212,7 +212,7 @@ def _rows_to_fit(
             "that begins with an indentation"
         )
     time, first, then = time[:kept], first[:kept], then[:kept]
-    # The added rows lie on straight lines. Among them, the scatter of the measured rows would not be found.
+    # This is done before rows are added, because added rows lie on straight lines and would hide the scatter.
     first, told = without_scatter(time, first, described.drive)
     d, force = (first, then) if by_displacement else (then, first)
     if described.test in ("sphere", "cone") and by_displacement:
@@ -234,15 +234,15 @@ def _while_contact_grows(time: np.ndarray, depth: np.ndarray) -> tuple[int, list
 
 
 def _while_punch_presses(time: np.ndarray, depth: np.ndarray, force: np.ndarray) -> tuple[int, list[str]]:
-    """Return the number of rows before a punch loses the contact, and a note if it loses the contact: it goes back, and
-    its force falls to 0 before the depth falls to 0. While a punch presses on the sample, its contact does not shrink,
-    so it may go back."""
+    """Return the number of rows before a punch loses the contact, and a note on this loss. A punch loses the contact if
+    it goes back and its force falls to 0 before its depth falls to 0. While a punch presses on the sample, its contact
+    does not shrink, so it may go back."""
     loaded = int(np.argmax(depth > AT_REST * depth.max()))
     smooth = scipy.ndimage.median_filter(force, _ROWS, mode="nearest")  # removes single low values
     smooth -= np.median(force[:loaded]) if loaded >= _ROWS else 0.0  # the sensor may have an offset
     least = max(AT_REST * smooth.max(), _NO_FORCE * noise_of_series(force))
     free = _gone_back(depth) & (smooth <= least)
-    # In a cycle, force and depth may fall to 0 together. A punch that is lifted between two rows was deep before.
+    # Force and depth may fall to 0 together in a cycle. A punch may be lifted between rows: the row before counts too.
     deep = min(_DEEP * least / max(smooth.max(), 1e-300), _DEEPEST) * depth.max()
     free &= np.maximum(depth, np.append(depth[:1], depth[:-1])) > deep
     if not free.any():
@@ -255,7 +255,7 @@ def _while_punch_presses(time: np.ndarray, depth: np.ndarray, force: np.ndarray)
 
 
 def _gone_back(depth: np.ndarray) -> np.ndarray:
-    """Return whether the indenter has gone back from its largest depth before each row (n,)."""
+    """Return for each row (n,) whether the depth is clearly below the largest depth so far (`_BACK`, `_FALL`)."""
     depth = np.maximum(depth, 0.0)
     # The largest of n values with Gaussian noise is expected at sqrt(2 ln(n)) standard deviations.
     deviation = noise_of_series(depth) * np.sqrt(2 * np.log(len(depth)))
@@ -294,10 +294,10 @@ def _description(path: Path) -> Described:
         table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}): give a TOML file that describes a test") from None
-    except ValueError as error:  # TOML, coding, or a whole number with more digits than Python reads
+    except ValueError as error:  # wrong TOML or text encoding, or an integer with more digits than Python reads
         raise InputError(f"{path} is not valid TOML ({error}): correct this line") from None
     test = table.get("test")
-    if test not in tuple(TESTS):  # a list from the file could not be looked up in a dictionary
+    if test not in tuple(TESTS):  # the value may be a list, which cannot be looked up in a dictionary
         raise InputError(f"{path}: test = {test!r} is not known: {hint(str(test), TESTS)}")
     needed, known = TESTS[test], (*_OTHER, *TESTS[test])
     for key in table:
@@ -366,12 +366,12 @@ def _elastic(
 
 
 def _change_per_size(described: Described, largest: float) -> tuple[float, float]:
-    """Return the relative change of the moduli per metre of the height or thickness, and per metre of the radius. For a
-    glued punch, this is the radius of the punch. The half angle of a cone is assumed to be exact.
+    """Return the relative change of the moduli per metre of the height or thickness, and per metre by which the radius
+    decreases. For a glued punch, the radius is that of the punch. The half angle of a cone is assumed to be exact.
 
     These numbers are only for errors, so approximations are enough for glued samples. The stiffness of a glued cylinder
-    is that of Gent and Lindley (1959, Proc. Inst. Mech. Eng. 173:111). A glued punch is a punch on a wide layer. If its
-    radius is more than `thin_layer.WIDEST` heights, the numbers are those of a punch with this ratio.
+    is that of Gent and Lindley (1959, Proc. Inst. Mech. Eng. 173:111). A sample under a glued punch is treated as a
+    wide layer. It is taken as thicker if the radius of the punch exceeds `thin_layer.WIDEST` heights.
     """
     sizes, test = described.sizes, described.test
     height, radius = sizes.get("thickness", sizes.get("height", 0.0)), sizes.get("punch", sizes.get("radius", 0.0))
@@ -384,7 +384,7 @@ def _change_per_size(described: Described, largest: float) -> tuple[float, float
         layer = thin_layer.Layer(thin_layer.Indenter(shape, height, described.poisson, radius, angle))
         return float(layer.force(np.array([largest]))[0])
 
-    # A thicker layer and a smaller indenter stay within the table of forces. Only the ratio of the sizes matters.
+    # A thicker layer and a smaller indenter stay within the table of forces, in which only the ratio of sizes matters.
     used = max(height, radius / thin_layer.WIDEST) if test == "glued_punch" else height
     own, thicker, smaller = force(used, radius), force((1 + _STEP) * used, radius), force(used, (1 - _STEP) * radius)
     by_radius = (1 - smaller / own) / (_STEP * radius) if radius else 0.0
@@ -419,7 +419,7 @@ def _glued_curve(
     if back > _REVERSED * height:
         try:
             other, reverse, told = secants(described, -back, path)
-        except InputError as error:  # `np.interp` below then returns the first secant there
+        except InputError as error:  # `np.interp` below then returns the first secant for this direction
             cause = str(error).removeprefix(f"{path}: ").partition(";")[0]  # without the remedy
             other, reverse, told = at[:0], secant[:0], [f"the force is assumed to be linear there, because {cause}"]
         at, secant = np.concatenate([other[::-1], at]), np.concatenate([reverse[::-1], secant])

@@ -49,7 +49,7 @@ class Cells(NamedTuple):
     edge: float = 0.02  # in a sector: cell size at the edge of a punch, divided by the shortest dimension at this edge
     largest: float = 0.34  # in a sector: longest cells, divided by the radius; along the axis, twice this length
     growth: float = cylinders.GROWTH  # increase of the cell length per distance from rims and edge
-    corners: int = 24  # number of corners of the polygon that replaces the circle; a sector has one of its sides
+    corners: int = 24  # number of corners of the polygon that replaces the circle; a sector has one side of it
     order: int = 2  # order of the elements
     volumetric: str = "auto"  # how the elements treat volume changes, see `lj.Solve`
 
@@ -106,7 +106,8 @@ def _changed_by_mesh(rig: Rig, run: lj.Result) -> jax.Array:
 
 def reading_errors(rig: Rig, law: Law, prony: Prony | None) -> tuple[jax.Array, np.ndarray]:
     """Estimate how each reading (T,) [N] or [m] would change with an infinitely fine mesh (see `mesh_error`), and with
-    infinitely small time steps. With smaller time steps too, the load rises over the whole first step of the rig."""
+    infinitely small time steps. The rise of the load does not change: with smaller time steps too, it lasts as long as
+    the first step of the rig."""
     scene = _with(rig, law, prony)
     run = lj.simulate(scene, mesh_error=True)
     dt, steps = scene.solve.dt, scene.solve.steps

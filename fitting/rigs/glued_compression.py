@@ -30,7 +30,8 @@ RIMS = (0.1, 0.25)
 #: Size of the cells at the rim of a second mesh, divided by their size in the first mesh. Both meshes have the same
 #: number of cells.
 COARSER = 2.5
-#: Order of convergence with the size of these cells. Sizes of 0.25, 0.1 and 0.04 gave an order of 0.74.
+#: Order of convergence with the cell size at the rims. Simulations with the sizes 0.25, 0.1 and 0.04 gave an order of
+#: 0.74.
 ORDER = 0.75
 #: Length of the longest cells, divided by the radius. Along the axis, cells may be twice as long.
 LARGEST = 0.34
@@ -50,9 +51,9 @@ class Glued(NamedTuple):
 def glued(radius: float, gap: float, law: Law, strain: float) -> tuple[Glued, Glued]:
     """Return (values, change) for a sample that is compressed by `strain` between glued plates.
 
-    values: factors and force, extrapolated with `ORDER` from the results of two meshes. This order is low because
-    stresses are infinite at the rims. change: change of each value due to the extrapolation, with its sign. It is an
-    estimate of the mesh error.
+    values: factors and force, extrapolated with `ORDER` from the results of two meshes. `ORDER` is low because stresses
+    are infinite at the rims. change: extrapolated value minus the value from the finer mesh. This is an estimate of the
+    mesh error.
 
     Args:
         radius: radius of the plates, and of the sample at rest [m].
@@ -85,7 +86,7 @@ def _quarter(radius: float, height: float, rim: float, coarser: float) -> lj.Tet
 
 
 def _wider(places: np.ndarray, factor: float) -> np.ndarray:
-    """Move positions that begin at 0: the position next to 0 gets `factor` times its distance from 0, and the last
+    """Move positions that begin at 0. The position next to 0 moves to `factor` times its distance from 0, and the last
     position does not move."""
     end = places[-1]
     return end * (places / end) ** (1 + np.log(factor) / np.log(places[1] / end))

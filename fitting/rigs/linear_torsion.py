@@ -1,5 +1,5 @@
-"""The torsion rig (rheometer with its sample) at small strain: stiffness, bias of the mesh, and moduli without time
-steps."""
+"""The torsion rig (rheometer with its sample) at small strain: stiffness, bias of the mesh, and moduli without a
+simulation in time."""
 
 from typing import NamedTuple
 
@@ -83,7 +83,7 @@ def geometry_factor(rig: Rig, law: Law) -> jax.Array:
 
 class Vibrations(NamedTuple):
     """Vibration modes of the elastic rig: K v = value M v, with the stiffness K, the lumped masses M and vectors v of
-    unit modal mass. Derivatives do not pass through the modes."""
+    unit modal mass. The modes are treated as constant in derivatives."""
 
     values: jax.Array  # (n,) [1/s^2]
     vectors: jax.Array  # (n, n) [kg^-1/2]
@@ -96,7 +96,7 @@ class Vibrations(NamedTuple):
 class Linearised(NamedTuple):
     """Matrices of the linearised rig with n coordinates. They are the same for all frequencies."""
 
-    inverse: jax.Array  # (n, n) inverse of the stiffness before relaxation, for very fast motions
+    inverse: jax.Array  # (n, n) inverse of the stiffness before relaxation (for very fast motions)
     relaxing: jax.Array | None  # (n, n) [N/m] relaxing part of the stiffness; None: the whole stress relaxes
     standing: jax.Array | None  # (n, n) [N/m] part that does not relax; None: the whole stress relaxes
     held: "Held | None" = None  # the compressed sample; None: not compressed
@@ -187,8 +187,9 @@ def torque_for_strain(rig: Rig, modulus: Number, strain: Number) -> Number:
 
 
 def linear_moduli(law: Law, prony: Prony, omega: jax.Array, steps: int | None) -> jax.Array:
-    """Return the complex moduli (n,) [Pa] at small strain that the recursion (the update of the history variables from
-    step to step) gives. They are the limit of `torsion.moduli` for small strain.
+    """Return the complex moduli (n,) [Pa] of the simulation at small strain. With `steps`, they contain the error of
+    the recursion that updates the history variables in each time step. They are the limit of `torsion.moduli` for small
+    strain.
 
     In this limit, the rig is linear, and dividing by the bias removes the error of the mesh. So the moduli depend
     neither on the mesh nor on the plates. Up to an error of the order of the strain, their derivatives with respect to
@@ -253,7 +254,8 @@ def moving_response(rest: Linearised, modulus: Number, square: Number) -> Respon
 
 
 def held_moduli(of: Held, rig: Rig, prony: Prony, omega: jax.Array, steps: int | None) -> jax.Array:
-    """Return the complex moduli (n,) [Pa] of the compressed sample `of` at small strain, computed on its mesh.
+    """Return the complex moduli (n,) [Pa] of the compressed sample `of` at small strain. They are computed on the mesh
+    of the rig and divided by the bias of this mesh.
 
     Args:
         of, rig: the compressed sample and its rig.

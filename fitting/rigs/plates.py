@@ -87,7 +87,8 @@ def make_rig(
 def rig_from_mesh(
     mesh: TetMesh, radius: float, height: float, free_height: bool = False, density: float | None = None
 ) -> Rig:
-    """Return a rig with any mesh. The axis of the mesh must be z, and the plates are its lowest and highest planes."""
+    """Return a rig with the given mesh. The axis of the mesh must be z, and the plates are its lowest and highest
+    planes."""
     points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     z = points[:, 2]
     near = 1e-9 * (z.max() - z.min())

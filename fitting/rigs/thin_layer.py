@@ -20,7 +20,7 @@ from liverjax.core.errors import InputError
 
 #: Largest contact radius in a table, divided by the thickness.
 WIDEST = 8.0
-#: Upper end of the integrals over eta = xi h. Above it, 1 - K(eta) is below 1e-13 (it falls as eta^2 exp(-2 eta)).
+#: Upper end of integrals over eta = xi h. For larger eta, 1 - K(eta) is below 1e-13 (falling as eta^2 exp(-2 eta)).
 _LAST_WAVE = 20.0
 #: _WAVES: number of Gauss points over eta. _POINTS: number of Gauss points over the contact radius. _ROWS: number of
 #: contact radii in the table.
@@ -71,7 +71,7 @@ def factors(poisson: float, shape: str) -> Factors:
     """Compute the table of force factors for a sphere or a cone, for contact radii from 0 to 8 times the thickness.
 
     Args:
-        poisson: 0 to 0.5.
+        poisson: Poisson's ratio of the layer, 0 to 0.5.
         shape: "sphere" or "cone".
     """
     power = {"sphere": 1.5, "cone": 2.0}[shape]
@@ -171,5 +171,5 @@ def series(chi: np.ndarray, poisson: float) -> np.ndarray:
 
 def dimitriadis(chi: np.ndarray) -> np.ndarray:
     """Return the force of a sphere on an incompressible layer, divided by its force on a half-space, for small chi =
-    sqrt(R d)/h (radius R, depth d, thickness h). The formula is printed by Dimitriadis et al. (equation 12)."""
+    sqrt(R d)/h (radius R, depth d, thickness h). The formula is from Dimitriadis et al. (equation 12)."""
     return 1 + 1.133 * chi + 1.283 * chi**2 + 0.769 * chi**3 + 0.0975 * chi**4

@@ -29,14 +29,15 @@ def order_of_steps(scene: Scene) -> int:
 
 
 def _begins_with_load(scene: Scene) -> bool:
-    """Return whether a load or a prescribed motion is not 0 at the beginning. It then rises during the first step, so
-    half the step also halves the time of the rise."""
+    """Return whether a load or a prescribed motion is not 0 at the beginning. Such a load rises during the first step,
+    so in a run with half the time step, the rise is also half as long."""
     loads = [own.value for own in scene.traction if own.times is None]
     if scene.body is not None and scene.body.times is None:
         loads.append(scene.body.gravity)
     for part in histories(scene).values():
         begin = np.asarray(entry_at(0.0, getattr(part, "times", None), getattr(part, "history", np.zeros(0))))
-        # A support whose stiffness changes has no tension at the beginning, and a moved obstacle may be far away.
+        # These parts begin without a load: a support with changing stiffness has no tension then, and a moved obstacle
+        # may be far away.
         if isinstance(part, ElasticSupport) and begin.ndim == 0:
             continue
         if isinstance(part, Obstacle) and not isinstance(part, PressedObstacle):

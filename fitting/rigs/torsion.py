@@ -111,7 +111,7 @@ def scene_of(
     of the stiffness, which is possible because the mesh is small.
 
     Raises:
-        InputError: the rig is compressed (`fitting.rigs.compression`), and the scene would begin uncompressed.
+        InputError: the rig is compressed (`fitting.rigs.compression`), but a scene begins with an uncompressed sample.
     """
     _check_drive(drive)
     if rig.held is not None:
@@ -179,13 +179,13 @@ class _Oscillation(NamedTuple):
 
 
 class _Cycle(NamedTuple):
-    """The steady cycle of the rig, linearised about rest and with the same time steps, and the preconditioner for the
-    solution of a time step."""
+    """The steady cycle of the linearised rig with the same time steps, and the preconditioner for the solution of a
+    time step. The rig is linearised about rest."""
 
     steady: Response
     arc: Number | complex  # amplitude of the last coordinate [m]
     precondition: Callable[[jax.Array], jax.Array]  # approximate inverse of the tangent matrix of the unknowns
-    twist: Number = 0.0  # [N] torque / radius at angle 0, subtracted: a compressed mesh is not quite symmetric
+    twist: Number = 0.0  # [N] torque / radius at the angle 0 (see `_twist`), which is subtracted
 
     def at(self, omega: Number, t: Number) -> jax.Array:
         """Return the coordinates at time t [s]."""
@@ -257,7 +257,7 @@ def _time_step(o: _Oscillation, cycle: _Cycle, carry: tuple, t: jax.Array) -> tu
     steps, tolerance = o.drive.steps * o.drive.cycles, o.drive.options.tolerance
     if not o.by_torque and o.drive.start == "rest":
         # The velocity of the top plate jumps at the start, so its acceleration would oscillate in the average
-        # acceleration method. Therefore the acceleration follows from the given angle.
+        # acceleration method. Therefore this acceleration is computed from the given angle.
         mask = mask.at[len(mask) - rig.top :, :2].set(0.0)
         still = jnp.zeros_like(o.solved_part(q_old))
         place = lambda k: o.positions(o.full(still, k * o.dt))  # noqa: E731
@@ -294,8 +294,8 @@ def _time_step(o: _Oscillation, cycle: _Cycle, carry: tuple, t: jax.Array) -> tu
 
 
 def _without_last(inverse: jax.Array) -> jax.Array:
-    """Remove the last row and column of a symmetric matrix, and return the inverse of the rest (Schur complement).
-    `inverse`: inverse of the whole matrix."""
+    """Return the inverse of a symmetric matrix without its last row and column (Schur complement). `inverse`: inverse
+    of the matrix with this row and column."""
     b = inverse[:-1, -1]
     return inverse[:-1, :-1] - jnp.outer(b, b) / inverse[-1, -1]
 
@@ -322,8 +322,8 @@ def _initial(o: _Oscillation, shape: jax.Array, arc: Number | complex) -> tuple[
     if prony is not None and on_cycle:
         _, slope = jax.linearize(S, jnp.zeros_like(q))
         S_shape = slope(jnp.real(shape)) * arc
-        # A real shape needs only the derivative along its real part. The other derivative would be a fifth of the
-        # compiled program.
+        # If the shape is real, the derivative along its imaginary part is not needed. This derivative would be a fifth
+        # of the compiled program.
         if jnp.iscomplexobj(shape):
             S_shape += slope(jnp.imag(shape)) * 1j * arc
         ratios = viscosity.complex_ratios(prony, o.omega, o.dt)
@@ -393,16 +393,16 @@ def moduli(
         return Moduli(jnp.real(G), jnp.imag(G), jnp.abs(angle) * rig.radius / rig.height, defect, bias, worst)
 
     lanes = jnp.atleast_1d(omega), jnp.atleast_1d(amplitude)
-    # On a CPU, one oscillation runs after the other, because each fits into the cache (1.7 times faster for the
-    # Jacobian). A GPU runs all of them at once.
+    # On a CPU, the oscillations run one after another, because the data of one oscillation fit into the cache (1.7
+    # times faster for the Jacobian). A GPU runs all of them at once.
     return jax.lax.map(lambda lane: one(*lane), lanes) if jax.default_backend() == "cpu" else jax.vmap(one)(*lanes)
 
 
 def strain_sweep(
     rig: Rig, law: Law, prony: Prony | None, strains: Numbers, omega: float = 2 * math.pi, drive: Drive | None = None
 ) -> Moduli:
-    """Return the moduli of a dynamic strain sweep (section 5.2) at strain amplitudes of the rim. By default, the angle
-    is imposed, for three cycles at each amplitude.
+    """Return the moduli of a dynamic strain sweep (chapter, section 5.2) for strain amplitudes at the rim. By default,
+    the angle is imposed, for three cycles at each amplitude.
 
     Args:
         strains: amplitudes at the rim, e.g. 1e-4 … 0.2.

@@ -50,14 +50,14 @@ class Matrices(NamedTuple):
     pressure: np.ndarray  # lower triangle of g B B^H, stored by diagonals (bandwidth + 1, I)
     balances: int  # number of real equations in chi^2
     parts: tuple[slice, ...]  # rows of C of each part of the body; rows of different parts share no unknowns
-    typical: float  # storage modulus [Pa] to which the size of the pressure term belongs
+    typical: float  # storage modulus [Pa] from which the size of the pressure term is computed
 
 
 #: FREE: size of the pressure term g B B^H of S, divided by the size of the term C C^H at a typical modulus
-#: (`Matrices.typical`). Since this ratio is finite, the pressure is not quite free. The relative error due to this is
-#: about (G / typical modulus)^2 / FREE for the modulus G. In a small stiff region it is larger: 2 % for a cylinder with
-#: a radius of 2.5 voxels that is three times as stiff as its surroundings. The pressure term is the same for all moduli
-#: of a fit, so that values of chi^2 for different moduli can be compared.
+#: (`Matrices.typical`). Since this ratio is finite, the pressure is slightly restricted by its prior. For a modulus G,
+#: the relative error due to this restriction is about (G / typical modulus)^2 / FREE. In a small stiff region, the
+#: error is larger: 2 % for a cylinder with a radius of 2.5 voxels that is three times as stiff as its surroundings. The
+#: pressure term is the same for all moduli of a fit, so that values of chi^2 for different moduli can be compared.
 #: TYPICAL: typical modulus [Pa] before the waves are known; `with_typical` changes it.
 FREE, TYPICAL = 1e4, 3000.0
 
@@ -83,8 +83,8 @@ class Balanced(NamedTuple):
     factor: np.ndarray  # (bandwidth + 1, I): L of S = L L^H, stored by diagonals
 
     def of(self, rows: slice) -> "Balanced":
-        """Return the multipliers and the factor for some rows of C only. These rows must share no unknowns with the
-        other rows. The motion is not changed."""
+        """Return the same result, but with the multipliers and the factor for only the given rows of C. These rows must
+        share no unknowns with the other rows."""
         return self._replace(multipliers=self.multipliers[rows], factor=self.factor[:, rows])
 
     def whitened(self, columns: scipy.sparse.csc_array, kind: type = np.complex128) -> np.ndarray:
@@ -135,7 +135,7 @@ def matrices(body: VoxelBody, density: float) -> Matrices:
 
 
 def with_typical(m: Matrices, modulus: float) -> Matrices:
-    """Return the same matrices with a pressure term of the size that belongs to this typical modulus [Pa]."""
+    """Return the same matrices, but with the pressure term for the typical modulus `modulus` [Pa]."""
     return m._replace(pressure=m.pressure * (modulus / m.typical) ** 2, typical=modulus)
 
 
@@ -219,15 +219,15 @@ def likeliest(
 
     Args:
         C: matrix (I, U) of the force balance.
-        B: covariance g B B^H of the forces of the pressures, its lower triangle stored by diagonals.
+        B: lower triangle of the covariance g B B^H of the pressure forces, stored by diagonals.
         d: measured motion (U,) [m]; 0 where it was not measured.
         sd: standard deviation of real and imaginary part of one component [m].
         spread: variance (U,) of the difference between each unknown and d, divided by sd^2; None: 1.
     """
     CH = C.conj().T.tocsr()
     WCH = CH if spread is None else scipy.sparse.diags_array(spread) @ CH
-    # S is Hermitian and positive definite. So no pivots are needed, and an order for symmetric matrices keeps the
-    # factor small.
+    # S is Hermitian and positive definite, so its factorisation needs no pivots. So the rows stay in an order that
+    # keeps the factor small.
     S = by_diagonals((C @ WCH).tocsr())
     if len(S) < len(B):
         S = np.pad(S, ((0, len(B) - len(S)), (0, 0)))

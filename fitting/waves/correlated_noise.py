@@ -1,4 +1,4 @@
-"""Estimate the ratio of the errors of moduli due to correlated noise to the errors due to white noise. "Correlated"
+"""Estimate the factor by which the errors of moduli are larger for correlated noise than for white noise. "Correlated"
 means: correlated between neighbouring voxels.
 
 Scanners and filters smooth the data, so the noise of neighbouring voxels is correlated. Then the data contain fewer
@@ -9,7 +9,7 @@ projected in the same way. The comparison shows which width of a Gaussian filter
 each axis, and which fraction of the noise remains in the residuals.
 
 The error of a modulus is the sum v^H n / H over the voxels, with the noise n, v = C^H S^-1 C' u and H = (C' u)^H S^-1
-C' u (the symbols are explained in `fitting.waves.balance`). So the variance for white noise is multiplied by
+C' u. The other symbols are explained in `fitting.waves.balance`. So the variance for white noise is multiplied by
 
     sum_l R(l) sum_x conj(v(x)) v(x + l) / sum_x |v(x)|^2,
 
@@ -26,8 +26,8 @@ import scipy.sparse
 from fitting.waves.balance import Balanced
 
 #: WIDTHS: standard deviations [voxels] of the Gaussian filters that are tried. DRAWS: number of random draws for each
-#: width in a body of SMALL voxels. In a body of n voxels it is DRAWS SMALL / n, but at least 1. REACH: half length of a
-#: filter [voxels].
+#: width in a body of SMALL voxels. In a body of n voxels, this number is DRAWS SMALL / n, but at least 1. REACH: half
+#: length of a filter [voxels].
 WIDTHS = (0.0, 0.35, 0.45, 0.55, 0.65, 0.75, 0.9, 1.1, 1.4, 1.8)
 DRAWS, SMALL, REACH = 6, 1500, 6
 #: The noise is regarded as correlated if the correlation of neighbouring residuals exceeds the correlation for white
@@ -38,7 +38,7 @@ SEEN, BY_CHANCE = 0.04, 4.0
 class Correlation(NamedTuple):
     """The correlation of the noise at one frequency, estimated from the residuals."""
 
-    beyond: float  # correlation of neighbouring residuals minus that for white noise: the largest value of the 3 axes
+    beyond: float  # correlation of neighbouring residuals minus its value for white noise; largest of 3 axes
     seen: bool  # whether this difference is larger than expected from white noise
     # (R,) error of each modulus, divided by its error for white noise. The sd of this white noise is the given sd if
     # `seen`, otherwise the sd of the noise itself.

@@ -24,7 +24,7 @@ from fitting.readers.units import WAVE_UNITS
 from fitting.waves.shear_waves import DENSITY
 from liverjax.core.errors import InputError
 
-#: First words of a column heading, and the quantity of the column.
+#: Words at the beginning of a column heading, and the quantity that the column then contains.
 WORDS = (
     ("angular frequency", "frequency"),
     ("frequency", "frequency"),
@@ -39,7 +39,7 @@ ERRORS = {"sd", "std", "stdev", "stddev", "stderr", "se", "sem", "err", "error",
 ERRORS |= {"sigma", "uncertainty", "ci"}
 #: Number of neighbouring points to which a cubic is fitted. The residuals of these fits show the noise.
 _NEIGHBOURS = 5
-#: Relative scatter below this value may be the curvature of exact data.
+#: A relative scatter below this value may come from the curvature of data without noise.
 CURVED = 3e-3
 #: Minimum number of frequencies in a file.
 FEWEST = 3
@@ -77,7 +77,8 @@ class Dispersion(NamedTuple):
         return np.concatenate([smooth, factor * smooth_curve(self.angular_frequency, self.attenuation)])
 
     def _noise_of_attenuation(self) -> float:
-        """Return the relative noise of the attenuation, divided by that of the velocity; 1 if this may be chance."""
+        """Return the relative noise of the attenuation, divided by that of the velocity. Return 1 if the two may differ
+        by chance."""
         assert self.attenuation is not None
         omega, *columns = merged(self.angular_frequency, self.velocity, self.attenuation)
         freedom = len(omega) - _NEIGHBOURS

@@ -1,4 +1,4 @@
-"""Positions of the edges of regions between the voxel centres, and the uncertainty of these positions.
+"""Positions of the edges of regions, which may lie between voxel centres, and the uncertainty of these positions.
 
 The labels give one region for each whole voxel. Smoothed labels give the volume of a region, but the position of the
 edge has an error of a fraction of a voxel. For circles with a radius of 2.5 to 8 voxels, the error of the mean radius
@@ -48,7 +48,8 @@ class Patches(NamedTuple):
 
 
 class MovedEdges(NamedTuple):
-    """Edges of R regions that are moved by `FARTHER` out of the smaller region on each edge."""
+    """R regions after their edges are moved by `FARTHER`. Each edge is moved outwards from the smaller of its two
+    regions."""
 
     s: np.ndarray  # (R, V) smoothed indicator functions of the regions, from `places`
     rank: np.ndarray  # (R,) rank of each region by its size, from `ranks_of_regions`
@@ -61,15 +62,15 @@ def places(labels: np.ndarray, body: VoxelBody, known: np.ndarray, farther: floa
     """Return the smoothed indicator function s_k (R, V) of each label in `known` (R,), at the nodes.
 
     An indicator function is 1 inside the region and 0 outside. It is smoothed by the filter 2 g - g g with a Gaussian
-    filter g, because this filter hardly moves curved edges. A constant is added, so that the volume of each region is
-    the volume of its label.
+    filter g, because this filter hardly moves curved edges. A constant is added for each region except the largest, so
+    that the volume of the region is the volume of its label.
 
     Args:
         labels: label of each voxel (nx, ny, nz).
         body: only labels at the voxels of this body are used. Every other voxel gets the nearest of these labels.
         known: the R labels that occur in the body.
-        farther: distance [voxels] by which edges are moved. The edge between two regions is moved out of the smaller
-            one.
+        farther: distance [voxels] by which edges are moved. The edge between two regions is moved outwards from the
+            smaller region.
     """
     measured = np.zeros(labels.shape, bool)
     measured[tuple(body.voxel.T)] = True
@@ -97,12 +98,12 @@ def ranks_of_regions(labels: np.ndarray, body: VoxelBody, known: np.ndarray) -> 
 
 
 def moved_edges(labels: np.ndarray, body: VoxelBody, known: np.ndarray) -> MovedEdges:
-    """Return the edges that are moved by `FARTHER`. The arguments are those of `places`."""
+    """Return the regions with edges moved by `FARTHER`. The arguments are those of `places`."""
     return MovedEdges(places(labels, body, known, FARTHER), ranks_of_regions(labels, body, known))
 
 
 def _moved_out(s: np.ndarray, rank: np.ndarray, farther: float) -> np.ndarray:
-    """Return the indicator functions s (R, nx, ny, nz) with edges moved by `farther` [voxels] out of the smaller
+    """Return the indicator functions s (R, nx, ny, nz) with edges moved by `farther` [voxels] outwards from the smaller
     regions. `rank` (R,): rank of each region by its size."""
     out = s.copy()
     for k in np.flatnonzero(rank < len(s) - 1):  # the largest region is not moved
@@ -111,7 +112,8 @@ def _moved_out(s: np.ndarray, rank: np.ndarray, farther: float) -> np.ndarray:
         above = s[k] - others.max(axis=0)
         slope = np.stack(np.gradient(above))
         normal = slope / np.maximum(np.linalg.norm(slope, axis=0), 1e-12)
-        # The value of `above` at a distance `farther` against the normal moves there, outwards.
+        # Each voxel gets the value of `above` from the distance `farther` along the normal, which points inwards. So
+        # the edge moves outwards.
         moved = ndimage.map_coordinates(above, np.indices(above.shape) + farther * normal, order=3, mode="nearest")
         out[k] += np.where(rank[others.argmax(axis=0)] > rank[k], moved - above, 0.0)
     return out

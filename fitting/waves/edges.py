@@ -159,8 +159,8 @@ def _whole_parts(m: Matrices, body: VoxelBody, region: np.ndarray, chosen: np.nd
 
 
 def _cut_parts(body: VoxelBody, s: np.ndarray, cut: np.ndarray, kinked: np.ndarray) -> list[_CutElements]:
-    """Return the parts of the cut elements that lie in each region. The list has one entry for each region and chunk of
-    elements."""
+    """Divide the cut elements into parts that each lie in one region, and return these parts. The list has one entry
+    for each region and chunk of elements."""
     corners = _equal_parts(HALVINGS)  # (Q, 4, 4)
     lam = corners.mean(axis=1)
     N, dN = _quadratic_functions(lam)
@@ -197,8 +197,8 @@ def _parts_by_region(at: np.ndarray) -> np.ndarray:
     out = []
     for k in range(len(at)):
         g = at[k] - np.delete(at, k, axis=0).max(axis=0)
-        # The formula fails if two corners have equal values. So the values are changed by about 1e-3 of the largest
-        # value.
+        # The formula divides by the differences between the corner values. Equal values are avoided by changes of about
+        # 1e-3 of the largest value.
         g = g + 1e-3 * np.abs(g).max(axis=-1, keepdims=True) * np.array([0.0, 1.0, -1.5, 2.5]) + 1e-30
         apart = g[..., :, None] - g[..., None, :] + np.where(np.eye(4, dtype=bool), 1.0, 0.0)
         out.append(np.sum(np.maximum(g, 0) ** 3 / np.prod(apart, axis=-1), axis=-1))
@@ -270,8 +270,8 @@ def _pattern(
     parts: list[_CutElements], rows: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
     """Return the sparsity pattern of C: the sorted keys of the matrix entries (row times U plus column, for U columns),
-    and the ends of the rows in this list. Also return, for each entry of `parts`, which of its values belong to C, and
-    their positions in this list."""
+    and the ends of the rows in this list. Also return, for each entry of `parts`, which values of this entry belong to
+    C, and the positions of these values in the list of keys."""
     keys, insides, U = [], [], len(rows)
     for p in parts:
         unknowns, lines = _unknowns_and_rows(p, rows)

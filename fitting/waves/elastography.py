@@ -83,8 +83,8 @@ SIDES = (8, 7, 6)
 def body_that_fits(field: WaveField, most_memory: float, most_corners: int | None = None) -> VoxelBody | None:
     """Return the undivided body if its matrix factor for one frequency needs less than `most_memory` [GB].
 
-    Otherwise return the body divided into the largest parts for which this holds. Return None if no division is small
-    enough. A body with more corners than `most_corners` is not divided.
+    Otherwise return the divided body with the largest parts that need less than this memory. Return None if no division
+    is small enough. A body with more corners than `most_corners` is not divided.
     """
     body = body_of(field)
     if gigabytes(body) < most_memory:
@@ -99,8 +99,8 @@ GAPS = 0.8
 
 
 def notes_on_gaps(field: WaveField) -> list[str]:
-    """Return a note if many elements are missing because voxels within the organ have no displacement. An element
-    exists only if all 27 voxels of its brick are measured."""
+    """Return a note if many elements are missing because voxels within the organ have no displacement or are not in the
+    mask. An element exists only if all 27 voxels of its brick are measured and in the mask."""
     inside = field.mask & np.isfinite(field.displacement).all(axis=(0, 4))
     whole = scipy.ndimage.binary_fill_holes(inside)
     left, most = voxels.number_of_bricks(inside), voxels.number_of_bricks(whole)
@@ -206,7 +206,7 @@ def _biases(organ: Organ, moduli: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
                 each, weights = plane_wave_biases(G, organ.waves.omega[f], organ, strength)
                 known, mean = abs(G), each @ weights
             bias[f, r] = mean * known / abs(G)
-            # The uncertainty of the mean is the square root of the sum of squares of these contributions.
+            # The squares of these contributions add up to the square of the uncertainty of the mean.
             left[f, r] = weights * (each - mean) * known / abs(G)
     return bias, left
 

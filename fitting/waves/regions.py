@@ -79,12 +79,12 @@ class _State(NamedTuple):
 
 
 def first_modulus(m: Matrices, waves: MeasuredWaves, density: float, voxel: float, length: float) -> float:
-    """Return a rough storage modulus [Pa] of the whole body, from which the search for the moduli starts: the modulus
-    with the lowest chi^2 at the frequency whose motion is the largest relative to its noise. The loss modulus is `LOSS`
-    times the storage modulus.
+    """Return a rough storage modulus [Pa] of the whole body, from which the search for the moduli starts. This modulus
+    has the lowest chi^2 at the frequency with the largest ratio of motion to noise. The loss modulus is `LOSS` times
+    the storage modulus.
 
-    The moduli that are tried follow from the wavelengths that the voxels can show. So they have the right size for all
-    units of the data.
+    The moduli that are tried follow from the wavelengths that the voxels can show. So the order of magnitude of these
+    moduli is right for all units of the data.
 
     Args:
         m: result of `balance.matrices`.
@@ -101,7 +101,7 @@ def first_modulus(m: Matrices, waves: MeasuredWaves, density: float, voxel: floa
 
     def out_of_balance(logarithm: float) -> float:
         modulus = math.exp(logarithm)
-        # With the equations multiplied by this ratio, chi^2 is that for the pressure term of each modulus.
+        # Multiplying the equations by this ratio gives the same chi^2 as a pressure term for this modulus.
         C = balance.rows_of_balance(m, modulus * (1 + LOSS * 1j) * every, omega) * (m.typical / modulus)
         return balance.likeliest(C, m.pressure, motion, sd).chi2
 
@@ -126,11 +126,12 @@ def moduli_of_regions(
     Args:
         m: matrices from `edges.region_matrices`.
         waves: the measured waves.
-        start: starting point of the search: the complex modulus of each region [Pa], (R,), or (F, R) with own moduli
-            for each frequency. If the search converged at a lower frequency, it starts from the moduli that were found
-            there (at the nearest such frequency). If it does not converge from there, it starts again from `start`. The
-            result of the second search is used only if it converges.
-        progress: function that is called after every iteration, with its number and chi^2 per equation.
+        start: starting point of the search: the complex modulus of each region [Pa], (R,), or (F, R) with separate
+            moduli for each frequency. If the search converged at a lower frequency, it starts from the moduli that were
+            found there (at the nearest such frequency). If it does not converge from there, it starts again from
+            `start`. The result of the second search is used only if it converges.
+        progress: function that is called after every iteration, with the number of the iteration and chi^2 per
+            equation.
         voxel: voxel index of each node (V, 3), needed to estimate the correlation of the noise. If it is None, the
             noise is assumed to be white.
     """
@@ -184,7 +185,8 @@ def _one_frequency(m, waves, f, G, progress):
 
 
 def _in_errors(step: np.ndarray, covariance: np.ndarray, R: int) -> float:
-    """Return the largest step of the 2 R storage and loss moduli, divided by their standard errors."""
+    """Divide the steps of the 2 R storage and loss moduli by the standard errors of these moduli, and return the
+    largest ratio."""
     return float(np.max(np.abs(step[: 2 * R]) / np.sqrt(np.diagonal(covariance)[: 2 * R])))
 
 
@@ -215,7 +217,8 @@ def _of_labels(m: RegionMatrices, R: int) -> np.ndarray:
 
 
 def _least(now: _State, labels: np.ndarray) -> float:
-    """Return the smallest chi^2 for the moduli of `now`, over all positions of the edges (quadratic approximation)."""
+    """Return the minimum of chi^2 plus the prior term of the edge shifts, over all edge shifts, for the moduli of `now`
+    (quadratic approximation)."""
     R = len(now.G)
     g, H = now.gradient[2 * R :], (now.hessian + labels)[2 * R :, 2 * R :]
     return float(now.here.chi2 - g @ np.linalg.solve(H, g))

@@ -2,17 +2,18 @@
 
 At frequency f the complex modulus of an element is G = g_f exp(c + l_f). Here g_f is the modulus of a uniform organ
 that is fitted to the same waves. The real part of the exponent is ln(|G| / |g_f|), and the imaginary part is the
-difference of the loss angles of G and g_f. The term c is the mean, over the element, of a complex field (P,) with
-values at P corners, which is the same for all frequencies. The real and the imaginary part of this field have the prior
+difference of the loss angles of G and g_f. The term c is the mean of a complex field over the element. The field has
+values at P corners, and is the same for all frequencies. The real and the imaginary part of this field have the prior
 of `fitting.methods.prior`, with the same standard deviation. Each frequency has a complex unknown l_f, the level, with
 the prior mean 0 and the prior standard deviation `LEVEL`. The levels are needed because the ratios between the values
 g_f may be wrong if the organ is not uniform. With only one frequency there is no level, because a level would have the
 same effect as the mean of c.
 
 The data depend only on the means of the field over the elements. A field with opposite signs at neighbouring corners
-has the mean 0 in every element, so the data do not determine such a field. Beside a jump of the modulus, the most
-probable field contains it. Therefore the map shows the field after the filter 2 A - A A, where A is the mean of c over
-the elements around a corner. This filter removes the alternating field, and hardly changes a smooth field.
+has the mean 0 in every element, so the data do not determine such a field. Near a jump of the modulus, the most
+probable field contains such an alternating field. Therefore the map shows the field after the filter 2 A - A A, where A
+is the mean of c over the elements around a corner. This filter removes the alternating field, and hardly changes a
+smooth field.
 
 The prior standard deviation of c is increased step by step. The increase ends when chi^2 is as low as the number of
 equations (discrepancy principle; Morozov 1966), or when the logarithm of the evidence, -(chi^2/n + |z|^2)/2 - ln det H,
@@ -335,8 +336,8 @@ def _each_deviation(course, begun: _Begun, file, progress) -> list[tuple[_Reache
 
 
 def _next_start(course: Course, point: _Reached) -> _Reached:
-    """Return the state with which the search for the next prior standard deviation begins. Its map is that of
-    `point`, and its whitened field z is scaled."""
+    """Return the state with which the search for the next prior standard deviation begins. This state has the same map
+    as `point`, so its whitened field z is scaled."""
     return _reached(course, point.z * course.scales(point.k) / course.scales(point.k + 1), point.k + 1)
 
 
@@ -359,7 +360,7 @@ def _noise_factors(course: Course, point: _Reached, y: np.ndarray, excess: float
     return np.array(found)
 
 
-#: Noise factors of the frequencies are regarded as equal if their ratio is below this.
+#: The noise factors of all frequencies are regarded as equal if the ratio of the largest to the smallest is below this.
 _SAME = 1.05
 
 

@@ -96,7 +96,8 @@ def _sixths(brick: np.ndarray, cells: tuple[int, ...]) -> np.ndarray:
     """Return the corners (6 n, 4) of the elements of n bricks (n, 3). Along each axis, every second brick is a mirror
     image of the brick before.
 
-    So the diagonals have no common direction, and waves in all directions have about the same speed.
+    So the diagonals of the elements do not all have the same direction, and waves in all directions have about the same
+    speed.
     """
     out = []
     for order in itertools.permutations(range(3)):

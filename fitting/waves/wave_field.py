@@ -49,7 +49,7 @@ def read_waves(
         mask, labels: files with whole numbers on the same voxels, if the file of the displacements does not contain
             them.
         unit: unit of the displacements, one of `UNITS`. Default: the unit in the file, or m if the file has no unit.
-        spacing: spacing of the voxels (3,) [m], if the file does not contain the spacing or states a wrong one.
+        spacing: spacing of the voxels (3,) [m], if the file contains no spacing or a wrong spacing.
 
     Raises:
         InputError: the file cannot be used; the message states the file, the field, the value and what to do.
@@ -131,7 +131,7 @@ def _on_the_same_voxels(file: Path, key: str, spacing: np.ndarray, place: object
     `place`: position in space of the voxels of the waves (see `formats.PLACE`); None if the position is unknown.
     """
     values, own, elsewhere = formats.single(file, key, spacing_given)
-    number = np.maximum((*values.shape, 1, 1, 1)[:3], 1)  # of voxels along the axes; the shape is checked later
+    number = np.maximum((*values.shape, 1, 1, 1)[:3], 1)  # number of voxels along each axis; the shape is checked later
     if elsewhere is not None and place is not None:
         corners = np.array([(*at, 1) for at in itertools.product(*((0, n - 1) for n in number))])
         apart = np.linalg.norm(corners @ (np.asarray(elsewhere) - np.asarray(place)).T, axis=1).max()
@@ -152,8 +152,8 @@ def _on_the_same_voxels(file: Path, key: str, spacing: np.ndarray, place: object
 
 #: Two positions are regarded as equal if they differ by less than this (in voxels).
 SAME_PLACE = 0.1
-#: Two voxel sizes are regarded as equal if their relative difference is below `SAME_SIZE`, and if it changes the length
-#: of the whole array by less than `HALF` a voxel.
+#: Two voxel sizes are regarded as equal if their relative difference is below `SAME_SIZE`, and if this difference
+#: changes the length of the whole array by less than `HALF` a voxel.
 SAME_SIZE, HALF = 0.01, 0.5
 #: Components that are exactly 0 are reported if they occur in less than this fraction of the voxels.
 FEW = 0.2
@@ -400,7 +400,7 @@ def noise_of(field: WaveField) -> np.ndarray:
 
 def coarsened(field: WaveField, stride: int) -> WaveField:
     """Return a field with fewer voxels: the means over blocks of stride^3 voxels. A block is in the new mask if all its
-    voxels are in the mask. In a uniform organ, the means are a wave with the same wavelength."""
+    voxels are in the mask. In a uniform organ, the means form a wave with the same wavelength."""
     if stride == 1:
         return field
     n = np.array(field.mask.shape) // stride

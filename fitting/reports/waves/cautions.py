@@ -12,8 +12,8 @@ from fitting.waves.shear_waves import velocity_and_attenuation
 from fitting.waves.stiffness_map import FAR, WaveMap
 from fitting.waves.wave_field import WaveField
 
-#: Below this radius [voxels], the modulus of a region is unreliable. In tests, the moduli of cylinders of this radius
-#: were right within 8 %.
+#: Below this radius [voxels], the modulus of a region is unreliable. In tests with cylinders of this radius, the errors
+#: of the moduli were below 8 %.
 LEAST_RADIUS = 2.5
 #: Above this chi^2 per equation, the program warns that the model does not explain the data.
 TOO_FAR = 1.5
@@ -77,9 +77,11 @@ def cautions_of_elastography(organ: Organ, found: Found, drawn: WaveMap | None) 
 
 
 def _of_sizes_and_edges(field: WaveField, found: Found, moves: list[int]) -> list[str]:
-    """Return warnings about regions that are too small, and about edges that are not those of the labels.
+    """Return warnings about regions that are too small, and about regions whose edges are not where the labels place
+    them.
 
-    `moves`: numbers of the frequencies with motion. The others contain only noise and say nothing about a region.
+    `moves`: indices of the frequencies with motion. At the other frequencies, the data contain only noise and say
+    nothing about a region.
     """
     if found.parts is None or found.labels is None:
         return []
@@ -106,8 +108,8 @@ STEEP = 5.0
 def _of_edges_in_map(drawn: WaveMap) -> list[str]:
     """Return a warning if the map shows an edge between two materials.
 
-    The map smooths the edge. This error changes the map also at some distance from the edge, and `WaveMap.sd` contains
-    only its local part.
+    The map smooths the edge. The error due to this smoothing also changes the map at some distance from the edge, but
+    `WaveMap.sd` contains only the error near the edge.
     """
     if not np.any(drawn.change > STEEP * drawn.posterior_sd.min(axis=0)):
         return []
@@ -120,8 +122,8 @@ def _of_edges_in_map(drawn: WaveMap) -> list[str]:
 
 
 def _of_small_regions(field: WaveField, labels: np.ndarray) -> list[str]:
-    """Return a warning about regions in which no voxel is `LEAST_RADIUS` or more away from other regions. The surface
-    of the organ does not count as another region."""
+    """Return a warning about regions in which every voxel is less than `LEAST_RADIUS` voxels away from another region.
+    The surface of the organ does not count as another region."""
     assert field.labels is not None
     small = []
     for label in labels:
@@ -255,7 +257,8 @@ SLOW, FAST = 0.4, 15.0
 
 
 def _in_radians(hertz: np.ndarray) -> bool:
-    """Return whether all frequencies are whole numbers times 2 pi, and none is a whole number, within rounding."""
+    """Return whether every frequency is a whole number times 2 pi, but no frequency is itself a whole number (within
+    rounding errors)."""
 
     def whole(x: np.ndarray) -> np.ndarray:
         return np.abs(x - np.round(x)) < 5e-4
@@ -265,10 +268,10 @@ def _in_radians(hertz: np.ndarray) -> bool:
 
 def _of_scales(organ: Organ, found: Found, moves: list[int]) -> list[str]:
     """Return warnings about wave speeds outside the range of soft tissue, and about moduli that change with frequency
-    as in no material.
+    in a way that no material allows.
 
-    The balance of forces does not depend on the units, so chi^2 does not show a wrong unit. `moves`: numbers of the
-    frequencies with motion. The moduli at other frequencies are those of noise, so they are not checked.
+    The balance of forces does not depend on the units, so chi^2 does not show a wrong unit. `moves`: indices of the
+    frequencies with motion. At the other frequencies, the moduli are fitted to noise, so they are not checked.
     """
     if not moves:
         return []

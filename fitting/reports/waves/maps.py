@@ -64,8 +64,8 @@ def write_for_paraview(path: Path, organ: Organ, drawn: WaveMap) -> None:
 
 
 def in_space(field: WaveField) -> np.ndarray:
-    """Return the position of the voxels in space (3, 4) [m]: the vectors from voxel to voxel along the three axes of
-    the array, then the centre of the first voxel."""
+    """Return a matrix (3, 4) [m] with the position of the voxels in space. Its first three columns are the vectors from
+    a voxel to the next voxel along each axis of the array. Its last column is the centre of the first voxel."""
     return np.column_stack([np.diag(field.spacing), field.origin]) if field.place is None else field.place
 
 

@@ -23,7 +23,7 @@ FEWEST = 3
 #: A node of the map counts as different from the uniform organ if the logarithms of the two moduli differ by more than
 #: this many standard deviations.
 TOLD = 3.0
-#: A warning is given if the mean relative error of the springpot model, over the frequencies, exceeds this value.
+#: A warning is given if the relative error of the springpot model, averaged over the frequencies, exceeds this value.
 MISSED = 0.03
 
 
@@ -66,10 +66,11 @@ def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: n
 def _of_regions(organ: Organ, own: Regions, bias: np.ndarray, left: np.ndarray) -> list[Content]:
     """Return one dictionary for each of R regions, with lists over the F frequencies.
 
-    The errors contain the noise, the uncertain position of the edges, and the discretisation error of the elements. The
-    relative discretisation error was computed for 2 D plane waves (D directions, two polarisations). It has two parts:
-    its mean `bias` (F, R) over these waves, and the contribution `left` (F, R, 2 D) of each wave to the uncertainty of
-    this mean.
+    The entries `error_...` contain the noise, the uncertain position of the edges, and the discretisation error of the
+    elements. The entries `standard_error_...` do not contain the discretisation error. The relative discretisation
+    error was computed for plane waves in D directions with two polarisations, so for 2 D waves. It has two parts: its
+    mean `bias` (F, R) over these waves, and the contribution `left` (F, R, 2 D) of each wave to the uncertainty of this
+    mean.
     """
     omega, rows = organ.waves.omega, []
     for r in range(own.modulus.shape[1]):
@@ -136,8 +137,8 @@ def _springpots(sweeps: dict[str, Path]) -> tuple[Content | None, list[str]]:
 
 
 def _sweeps(out: Path, organ: Organ, content: Content) -> dict[str, Path]:
-    """Write a frequency sweep of the whole organ and of every region, for ``python -m fitting``, if there are enough
-    frequencies. Return the files."""
+    """Write files with a frequency sweep of the whole organ and of each region, for ``python -m fitting``. Return these
+    files. With fewer than `FEWEST` frequencies, no file is written."""
     if len(organ.field.frequencies) < FEWEST:
         return {}
     files = {}

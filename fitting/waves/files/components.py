@@ -1,8 +1,8 @@
 """Check from the data alone whether the components of the displacement are in the directions of the voxel axes.
 
 Shear waves do not change the volume, so the divergence of the displacement is small. The divergence is large if two
-components are exchanged, or if one has the wrong sign. Such errors occur when data are moved between programs, if one
-program stores arrays by rows and the other by columns.
+components are exchanged, or if a component has the wrong sign. Such errors occur when data are moved between programs,
+if one program stores arrays by rows and the other by columns.
 """
 
 import itertools

@@ -37,8 +37,8 @@ NAMES = (
     "unit",
 )
 WAVES = ("displacement", "real", "imag", "phases", "wrapped")
-#: Name of the entry for the position of the voxels in space (3, 4) [m]: the vectors from voxel to voxel along the three
-#: axes, then the position of the first voxel. Only NIfTI files have this entry.
+#: Name of the entry for the position of the voxels in space (3, 4) [m]: three columns with the vectors from a voxel to
+#: the next voxel along each axis, then a column with the position of the first voxel. Only NIfTI files have this entry.
 PLACE = "(place)"
 #: If a file states two different voxel sizes, the entry with this name contains the error message.
 CONFLICT = "(conflict)"
@@ -82,8 +82,8 @@ def arrays(path: Path) -> Content:
 
 
 def single(path: Path, name: str, spacing_given: bool = False) -> tuple[np.ndarray, object, object]:
-    """Return one array (nx, ny, nz), and the entries `spacing` and `PLACE` of the file. The array is the one with this
-    name, or the only array of the file.
+    """Return one array (nx, ny, nz), and the entries `spacing` and `PLACE` of the file. This is the array with the name
+    `name`, or else the only array of the file.
 
     Both entries are None if the file states two different spacings and the user gives the spacing.
     """
@@ -108,7 +108,7 @@ def _numpy(path: Path) -> Content:
             return {"displacement": np.load(path, allow_pickle=False)}
         with np.load(path, allow_pickle=False) as file:
             found = {name: file[name] for name in file} | _nearly_known(file)
-    except ValueError:  # even for a text file, NumPy's message would be about pickled objects
+    except ValueError:  # NumPy's message speaks of pickled objects, even for a text file
         raise InputError(
             f"{path}: the file has no arrays of numbers; write the file with numpy.save or numpy.savez"
         ) from None
@@ -129,8 +129,8 @@ def _matlab(path: Path) -> Content:
 
 
 def _nearly_known(names: Iterable[str]) -> Content:
-    """Return notes on unknown names that are similar to a known one, under `NEARLY`. Without such a note, the program
-    would ignore, for example, a mask with a misspelt name silently."""
+    """Return notes on unknown names that are similar to a known name, under the key `NEARLY`. Without these notes, the
+    user would not learn that, for example, a mask with a misspelt name is ignored."""
     names = list(names)
     waves = set(WAVES) & set(names)
     wanted = [name for name in NAMES if name not in names and not (waves and name in WAVES)]
@@ -165,7 +165,7 @@ def _hdf5(path: Path) -> Content:
                     f"{path}: {name} is a group that contains {inside}, not an array: write the arrays at the top level"
                 )
         found: Content = {name: _values(file[name]) for name in NAMES if name in file} | _nearly_known(file)
-        # The names may also be attributes of the file or of the array of waves.
+        # Values with these names may also be attributes of the file or of the array of waves.
         for own in (file, *(file[name] for name in WAVES if name in file)):
             found = {name: own.attrs[name] for name in NAMES if name in own.attrs} | found
     return _with_plain_unit(found)
@@ -309,8 +309,8 @@ def _grid(path: Path, X: np.ndarray, of: np.ndarray) -> tuple[np.ndarray, np.nda
         )
     origin = X.min(axis=0)
     regular, worst = None, ""
-    # Errors of positions have to be left out, but not the short steps in a body with wide gaps: there, different voxels
-    # would get the same index.
+    # Short steps that are errors of the positions must be ignored. In a body with wide gaps, short steps are real: if
+    # they are ignored, different voxels get the same index. So both cases are tried along each axis.
     for least in itertools.product((_JITTER, 0.0), repeat=3):
         spacing = np.array([_spacing_along(path, X[:, a] - origin[a], "xyz"[a], least[a]) for a in range(3)])
         at = np.rint((X - origin) / spacing).astype(int)

@@ -16,8 +16,8 @@ def unwrapped(name: str, phases: np.ndarray) -> tuple[np.ndarray, list[str]]:
 
     In space, pairs of neighbouring voxels are unwrapped in the order of their reliability (Herraez et al. 2002, Appl.
     Opt. 41, 7437). After this, a multiple of 2 pi may still be missing in the phase of a whole part of the volume. A
-    part is a set of connected voxels, for example one of two organs. Its multiple is chosen under the assumption that
-    its median phase changes by less than pi from one instant of the period to the next.
+    part is a set of connected voxels, for example one of two organs. The missing multiple of a part is found under the
+    assumption that the median phase of the part changes by less than pi from one instant of the period to the next.
 
     Args:
         name: name of the file, for the messages.
@@ -65,8 +65,8 @@ def _continuous_in_time(phases: np.ndarray) -> np.ndarray:
 
 
 def _of_steep_phases(phases: np.ndarray) -> list[str]:
-    """Return a note for each frequency at which the phases of many neighbouring voxels differ by nearly pi. This is the
-    largest difference that wrapped phases can show."""
+    """Return a note for each frequency at which the phases of many neighbouring voxels differ by nearly pi. Wrapped
+    phases cannot show a difference above pi."""
     notes = []
     for f, one in enumerate(phases):
         steps = [np.diff(one, axis=a) for a in (1, 2, 3)]
