@@ -157,10 +157,10 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
 
 
 def _sphere(problem: Problem, found: field.Field, with_mesh: bool) -> tuple[Content, bool]:
-    """Fit a sphere that begins at the map. Return its content of field.json, and whether the fit converged."""
+    """Fit a sphere that begins at the map. Return its entries in field.json, and whether the fit converged."""
     try:
         start = inclusion.start_from(problem, found)
-    except InputError as e:  # the map is finished, so it is written all the same
+    except InputError as e:  # the map is complete, so it is written without a sphere
         _warn(str(e))
         return {"warnings": [str(e)]}, False
     sphere = inclusion.estimate(problem, found.name, start)
@@ -174,8 +174,8 @@ def _sphere(problem: Problem, found: field.Field, with_mesh: bool) -> tuple[Cont
 
 
 def _tell_sizes(problem: Problem, beside: list[dict[str, float]]) -> None:
-    """Print a note if the errors of the meshes or the time steps are large compared with the noise. `beside`: their
-    sizes in each scene, divided by the noise."""
+    """Print a note if the errors of the meshes or the time steps are large compared with the noise. `beside`: for each
+    scene, the size of each error divided by the noise."""
     linear = any(scene.mesh.order == 1 for scene in problem.scenes)
     remedies = {"mesh": "a finer mesh, or order = 2," if linear else "a finer mesh", "time_step": "smaller time steps"}
     for kind in beside[0]:

@@ -42,7 +42,7 @@ HALF_ANGLE = 45.0
 
 
 def _notes_on_shape(options: argparse.Namespace) -> list[str]:
-    """Return notes on an assumed angle, and on options that have no effect for this shape."""
+    """Return notes on an assumed angle, on options without effect for this shape, and on a very large thickness."""
     cone, told = options.shape == "cone", []
     if cone and options.half_angle is None:
         told.append(

@@ -123,7 +123,7 @@ def run(options: argparse.Namespace) -> int:
         print(f"note: {note}", file=sys.stderr)
     shared_options.prepare_outputs(options, ("fit.json", "fit.png"), [options.file])
     found = fits.choose_in_time(test, options.model, options.modes)
-    if options.file.suffix.lower() != ".toml":  # this error is only for tests in a rheometer
+    if options.file.suffix.lower() != ".toml":  # only a test in a rheometer has this error
         default = Simulation()
         rig = Simulation(radius=options.radius or default.radius, height=options.height or default.height)
         found.details["geometry_error"] = total_error.of_geometry(rig, None, test.axial)

@@ -78,8 +78,8 @@ def check_samples(count: int | None) -> None:
 
 
 def has_draws(kind: "Kind") -> bool:
-    """Return whether the posterior of a fit with this kind of model can be drawn (--samples). A note is printed if it
-    cannot, because the model is the spectrum."""
+    """Return whether the posterior of a fit with this kind of model can be drawn (--samples). If the model is the
+    spectrum, the result is False, and a note is printed."""
     if kind.effective is None:
         return True
     print(
@@ -90,8 +90,8 @@ def has_draws(kind: "Kind") -> bool:
 
 
 def write_cards(out: Path, model: "Maxwell", of_fit: "Estimate | None" = None) -> None:
-    """Write material cards, and print notes on everything that a program cannot represent. `of_fit`: the fitted Prony
-    modes with their errors, if they are known."""
+    """Write material cards, and print notes on all parts of the model that a simulation program cannot represent.
+    `of_fit`: the fitted Prony modes with their errors, if the errors are known."""
     from fitting.methods.uncertainty import equilibrium_error
     from fitting.reports import material_cards
 
@@ -102,19 +102,19 @@ def write_cards(out: Path, model: "Maxwell", of_fit: "Estimate | None" = None) -
 
 
 def prepare_outputs(options: argparse.Namespace, files: tuple[str, ...], inputs: Iterable[Path]) -> None:
-    """Make the folder of the results, and check that all results can be written: `files`, and those that --samples,
-    --report and --cards request. No result may replace one of the `inputs`."""
+    """Make the folder of the results, and check that all result files can be written: `files`, and the files that
+    --samples, --report and --cards request. No result may replace one of the `inputs`."""
     asked = {"posterior.csv": options.samples, "report.pdf": getattr(options, "report", False)}
     names = (*files, *(name for name, wanted in asked.items() if wanted))
     writable(options.out, names, ("cards",) if options.cards else (), inputs)
 
 
 def usable_sweep(options: argparse.Namespace, path: Path, error_is_fitted: bool = False) -> "Sweep":
-    """Read a sweep, and ignore the points at which the instrument dominates. If --max-frequency is given, only these
-    points are ignored: points outside the band, and points at which the raw torque or the raw phase shows too much
-    inertia of the instrument (`without_inertia`). These points are also the only ignored ones if the file shows the
-    inertia and its error is fitted later (`error_is_fitted`), because this error may explain the mark of the
-    instrument."""
+    """Read a sweep, and ignore the points at which the instrument dominates. If --max-frequency is given, only two
+    kinds of points are ignored: points outside the band, and points at which the raw torque or the raw phase shows too
+    much inertia of the instrument (`without_inertia`). The same is true if the file shows the inertia and its error is
+    fitted later (`error_is_fitted`), because this error may explain the mark of the instrument (see
+    `kramers_kronig`)."""
     from fitting.readers import rheometer
 
     try:
@@ -131,10 +131,10 @@ def usable_sweep(options: argparse.Namespace, path: Path, error_is_fitted: bool 
 
 
 def without_instrument_or_sample(options: argparse.Namespace, sweep: "Sweep") -> "Sweep":
-    """Return the sweep without the points at which the instrument dominates. The moduli still contain the inertia of
-    the sample. If density and height of the sample are known, these points are searched in moduli without the inertia
-    of the sample. So this inertia is not mistaken for the inertia of the instrument. With --method torsion, the default
-    of --height is used, as in the fit."""
+    """Return the sweep without the points at which the instrument dominates. The returned moduli still contain the
+    inertia of the sample. If density and height of the sample are known, the search for these points uses moduli
+    without the inertia of the sample, so that it is not mistaken for the inertia of the instrument. With --method
+    torsion, the default of --height is used, as in the fit."""
     from fitting.fits import sample_inertia
     from fitting.fits.simulated_rheometer import Simulation
     from fitting.methods import kramers_kronig
@@ -152,7 +152,7 @@ def without_instrument_or_sample(options: argparse.Namespace, sweep: "Sweep") ->
         if strain:
             density = compression.torsional_density(laws.typical(options.law), strain, density)
         bare = sample_inertia.taken_off(sweep, density, height)
-    except InputError:  # a later step subtracts the inertia, and raises the error with its remedy
+    except InputError:  # a later step subtracts the inertia again, and raises this error with a remedy
         return kramers_kronig.without_instrument(sweep)
     kept = kramers_kronig.without_instrument(bare)
     told = tuple(note for note in kept.notes if note not in bare.notes)
@@ -166,7 +166,8 @@ def without_instrument_or_sample(options: argparse.Namespace, sweep: "Sweep") ->
 def may_explain_the_mark(options: argparse.Namespace) -> bool:
     """Return whether the fit of the instrument's errors is tried before points with the mark of the instrument are
     excluded. These points determine the error of the inertia best. The fit needs Prony modes. If the inertia of the
-    sample is subtracted, too, the points are excluded first, because this step may fail at such points."""
+    sample is subtracted too, the points are excluded first, because the subtraction may fail at such points. With
+    --max-frequency, no such points are excluded."""
     return options.model in ("prony", "auto") and options.density is None and not options.max_frequency
 
 

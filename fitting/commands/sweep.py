@@ -203,7 +203,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _master(options: argparse.Namespace) -> tuple["Sweep", dict, str]:
-    """Write and print the master curve of the files. Return its sweep, its entry of fit.json, and the printed table."""
+    """Write and print the master curve of the files. Return its sweep, its fit.json entry, and the printed table."""
     from fitting.master import master_curve, master_report, temperature_sweeps
 
     reference = None if options.master == MIDDLE else options.master + 273.15
@@ -212,7 +212,7 @@ def _master(options: argparse.Namespace) -> tuple["Sweep", dict, str]:
     data = temperature_sweeps.with_usable_points(data, band, options.radius, options.height)
     try:
         found = master_curve.master_curve(data, reference, options.vertical)
-    except InputError as error:  # an ignored temperature may be the cause
+    except InputError as error:  # the notes say which temperatures are ignored
         raise InputError("; ".join([str(error), *data.sweeps[0].notes])) from None
     files = ("shift_factors.csv", "master_curve.csv", "shift.png", "fit.json", "fit.png", "fit.h5")
     shared_options.prepare_outputs(options, files, [*options.sweep, *options.predict])
@@ -242,7 +242,7 @@ def _tests_to_predict(options: argparse.Namespace) -> list["Measured"]:
 
 
 def _predictions(tests: list["Measured"], sweep: "Sweep", fit: "Fit", shift: dict) -> list[str]:
-    """Return sentences on each test that the fit predicts. `shift`: the entry of `_master`, or empty."""
+    """Return sentences about each test that the fit predicts. `shift`: the fit.json entry from `_master`, or empty."""
     if not tests:
         return []
     from fitting.master import master_curve

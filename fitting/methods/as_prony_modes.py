@@ -1,8 +1,8 @@
 """Convert any linear viscoelastic model to Prony modes for the simulation, and compute the largest error in the band.
 
 The relaxation times are fixed, equally spaced on a log axis. The strengths (moduli of the modes) minimise the sum
-of the squared relative errors of G' and G''; no strength is negative. As long as the same strengths are above zero, the
-strengths are linear in the moduli of the model. So the conversion can be differentiated.
+of the squared relative errors of G' and G''; no strength is negative. As long as the same strengths are positive, all
+strengths are linear functions of the model's moduli. So the conversion can be differentiated.
 """
 
 from collections.abc import Callable
@@ -15,15 +15,15 @@ from fitting.methods.host import Array, arrays_of
 
 #: Maximum relative error of G' and G'' in the band that a conversion may have.
 ALLOWED = 0.01
-#: PER_DECADE: frequencies per decade at which a conversion is computed and checked. MARGINS: distances [decades] of the
-#: longest and the shortest relaxation time from the ends of the band. MOST: maximum number of modes.
+#: PER_DECADE: frequencies per decade at which a conversion is computed and checked. MARGINS: distances [decades] that
+#: are tried between each end of the band and the outermost relaxation time there. MOST: maximum number of modes.
 PER_DECADE, MARGINS, MOST = 20, (0.0, 0.25, 0.5, 1.0, 2.0), 60
 
 
 class Conversion(NamedTuple):
     """The linear map from the moduli of a model at n frequencies to N Prony modes that represent this model."""
 
-    omega: np.ndarray  # (n,) [rad/s], over the band
+    omega: np.ndarray  # (n,) [rad/s], frequencies over the band
     times: np.ndarray  # (N,) [s], descending
     solid: bool  # whether the first strength is an equilibrium modulus
     strengths_of: np.ndarray  # (N + solid, 2n): matrix from the moduli (G', then G'') to the strengths [Pa]
@@ -68,14 +68,14 @@ def convert(
         if best[0] < ALLOWED:
             break
     assert best is not None
-    if not solid and best[0] > ALLOWED:  # for example a springpot with a small exponent, nearly a spring
+    if not solid and best[0] > ALLOWED:  # for example a springpot with a small exponent: it is nearly a spring
         with_rest = convert(moduli, low, high, solid=True)
         if with_rest.error < best[0]:
             return with_rest
     error, times, strengths, A = best
     kept = strengths[solid:] > 1e-9 * strengths.sum()
     columns = np.concatenate([[True], kept]) if solid else kept
-    if solid and strengths[0] <= 1e-12 * strengths.sum():  # a modulus of zero stays zero, with derivative 0
+    if solid and strengths[0] <= 1e-12 * strengths.sum():  # the equilibrium modulus is zero: it is removed
         solid, columns = False, np.concatenate([[False], kept])
     weighed = A[:, columns] / target[:, None]
     return Conversion(omega, times[kept], solid, np.linalg.pinv(weighed) / target, error)

@@ -1,8 +1,8 @@
 """Fit the modulus and the contact point of a force-depth curve, if the force is proportional to the modulus.
 
-The force is F = E f(d - d0) at depth d, with the modulus E and the contact point d0. Before contact, F = 0. A straight
-base line may be added. For a given d0, the force is linear in all other unknowns. So only d0 is searched, first on a
-grid and then between the points of the grid (variable projection; Golub and Pereyra 1973).
+The force is F = E f(d - d0) at depth d, with the modulus E, the contact point d0 and the force f per unit modulus.
+Before contact, F = 0. A straight base line may be added. For a given d0, the force is linear in all other unknowns. So
+only d0 is searched, first on a grid, then between its points (variable projection; Golub and Pereyra 1973).
 """
 
 from collections.abc import Callable
@@ -20,17 +20,17 @@ _GRID = 200
 #: The contact point is searched up to BEFORE times the range of the depths before the first depth. If the misfit is
 #: smallest at this limit, the search continues up to _FARTHEST_BEFORE times this range.
 BEFORE, _FARTHEST_BEFORE = 0.5, 30.0
-#: The contact point is searched up to this distance before the last depth, divided by the range of the depths.
+#: Smallest distance of the contact point from the last depth in the search, divided by the range of the depths.
 SHALLOWEST = 1e-3
-#: Distance of neighbouring contact points for a central difference, divided by the range of the depths.
+#: Step of the contact point for a central difference, divided by the range of the depths.
 _NEIGHBOUR = 1e-5
 #: If the noise, divided by the largest fitted force, is below this value, the residuals are roundoff.
 _NOISELESS = 1e-7
 
 
 class ContactFit(NamedTuple):
-    """Fitted modulus and contact point. Their standard errors are valid for noise that is equal at all points, that
-    grows with the force, or that is correlated between neighbouring points."""
+    """Fitted modulus and contact point. Their standard errors are valid for noise that has the same size at all points,
+    that grows with the force, or that is correlated between neighbouring points."""
 
     modulus: float  # E [Pa]
     contact_point: float  # d0 [m]
@@ -43,7 +43,7 @@ class ContactFit(NamedTuple):
     offset_error: float = 0.0
     tilt: float = 0.0  # rise of the base line from the smallest to the largest depth [N]
     tilt_error: float = 0.0
-    independent: float | None = None  # number of independent points with the same information; None: all points
+    independent: float | None = None  # equivalent number of independent points; None: all points
 
     @property
     def quantile(self) -> float:
@@ -73,8 +73,8 @@ def fit_contact(
             from the contact point. Before contact, these depths are negative.
         base: model of the force without contact: "zero", "constant" (unknown offset of the sensor) or "line" (the
             sensor also drifts).
-        deepest: largest depth [m] from the contact point for which `unit_force` is known. Earlier contact points are
-            not tried. It must be larger than twice `SHALLOWEST` times the range of the depths.
+        deepest: largest depth [m] from the contact point for which `unit_force` is known. Contact points that give a
+            larger depth are not tried. `deepest` must be larger than twice `SHALLOWEST` times the range of the depths.
     """
     span = float(np.ptp(depth))
     h = _NEIGHBOUR * span
@@ -150,8 +150,8 @@ def _errors_of_any_noise(J: np.ndarray, residuals: np.ndarray, noise: float) -> 
 #: _FREE: only this fraction of the depths before the fitted contact point certainly lies before contact, because a tilt
 #: of the base line moves the fitted contact point. _FEWEST: minimum number of points in this part.
 _FREE, _FEWEST = 0.7, 8
-#: A tilt is used only if |tilt| / standard error exceeds _SEEN in a fit of the approach alone and _CLEAR in the fit of
-#: the whole curve.
+#: A tilt is used only if |tilt| / standard error exceeds _SEEN in a fit of the part before contact, and _CLEAR in the
+#: fit of the whole curve.
 _SEEN, _CLEAR = 2.0, 4.0
 #: The force before contact also counts as constant if it rises or falls by less than this fraction of the offset.
 _LEVEL = 0.1
@@ -177,8 +177,8 @@ def fit_with_offset(
     plain, free = (fit_contact(depth, force, unit_force, base, deepest) for base in BASES[:2])
     if free.before < _FEWEST or not free.modulus > 0:
         return plain
-    # If the offset is large, the fit without an offset explains it as a contact force and has no points before contact.
-    # In this case, the offset is used only if the fit becomes clearly better and the force before contact is constant.
+    # If the offset is large, the fit without an offset treats it as a contact force, and finds no points before
+    # contact. Then the offset is used only if it improves the fit clearly and the force before contact is constant.
     better = np.sum(plain.residuals**2) - np.sum(free.residuals**2) > _CLEAR**2 * free.noise**2
     slope, error = _slope_and_error(depth[depth <= free.contact_point], force[depth <= free.contact_point])
     before = depth[depth <= free.contact_point]

@@ -13,7 +13,7 @@ from fitting.methods.least_squares import Solution
 #: Value that replaces an infinite error in a covariance. The square of this value is still finite.
 LOST = 1e140
 
-#: In a square root of a covariance, singular values have at least this ratio to the largest one.
+#: Lower bound of the singular values of a square root of a covariance, divided by the largest singular value.
 _NO_SPREAD = 1e-10
 
 
@@ -29,7 +29,7 @@ class Estimate(NamedTuple):
     chi2: float  # sum of squares of the residuals, each divided by its given scale
     components: int  # number of measured values
     noise: float  # standard deviation of the data, divided by the given scales: 1, or estimated from the residuals
-    freedom: float  # components (if correlated: independent ones) minus the (effective) number of unknowns
+    freedom: float  # number of (independent) values minus the (effective) number of unknowns
     iterations: int
     converged: bool
     codes: tuple[int, ...] = ()  # most severe status code of each simulation
@@ -38,7 +38,7 @@ class Estimate(NamedTuple):
     time_step_bias: np.ndarray | None = None  # (P,) error of the values due to the time steps
     shared: np.ndarray | None = None  # (P, s) columns of `root`: errors common to all points (gap, instrument)
     mesh_over_noise: float | None = None  # root mean square of the mesh error, divided by the noise
-    warnings: tuple[str, ...] = ()  # warnings of the fit that do not follow from the other numbers
+    warnings: tuple[str, ...] = ()  # warnings of the fit that do not follow from the other fields
 
     @property
     def covariance(self) -> np.ndarray:
@@ -111,7 +111,7 @@ def noise_factor(residuals: np.ndarray, freedom: float, deviations_given: bool) 
     """Return the standard deviation of the noise, divided by the scales of the residuals.
 
     If no standard deviations are given, the noise is estimated from the residuals. Given standard deviations are used
-    unchanged, unless the residuals are larger. In that case, the errors are enlarged in the ratio of the residuals to
+    unchanged, unless the residuals are larger. In that case, the errors are multiplied by the ratio of the residuals to
     the deviations. The errors are never reduced (the rule of the Particle Data Group).
     """
     estimate = float(np.sqrt(np.sum(residuals**2) / max(1, freedom)))
@@ -119,8 +119,8 @@ def noise_factor(residuals: np.ndarray, freedom: float, deviations_given: bool) 
 
 
 #: Lower bound of the degrees of freedom for correlated noise. Three is the smallest whole number for which Student's t
-#: has a finite variance. With one degree, the 95 % quantile would be 12.7 instead of 3.2, but intervals of simulated
-#: sweeps would contain the truth hardly more often.
+#: has a finite variance. With one degree of freedom, the 95 % quantile would be 12.7 instead of 3.2. But the intervals
+#: of simulated sweeps would contain the true value hardly more often.
 LEAST_FREEDOM = 3.0
 
 
@@ -147,7 +147,7 @@ def spread(jacobian: np.ndarray, noise: float, to_natural: np.ndarray) -> tuple[
     if not (np.all(np.isfinite(jacobian)) and np.any(jacobian)):  # the fit could not begin: all errors are infinite
         return np.full((len(to_natural), jacobian.shape[1]), np.inf), np.zeros(min(jacobian.shape))
     scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
-    # Fewer residuals than unknowns leave directions that no residual determines: they need rows, too.
+    # If there are fewer residuals than unknowns, rows of zeros are added, so that the SVD returns all directions.
     missing = np.zeros((max(0, jacobian.shape[1] - len(jacobian)), jacobian.shape[1]))
     _, s, Vt = np.linalg.svd(np.vstack([jacobian / scale, missing]), full_matrices=False)
     # A direction that the data do not determine gets 1e14 times the error of the best determined direction. An infinite
@@ -166,13 +166,13 @@ def errors_and_correlation(root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def covering_root(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the square root (P, P) of a covariance that covers two covariances of P parameters. No combination of the
-    parameters has a smaller variance than in one of the two covariances.
+    """Return the square root (P, P) of a covariance that is at least as large as two given covariances of P parameters:
+    every linear combination of the parameters has at least the variance that each given covariance gives.
 
     Args:
         first, second: square roots (P, k) of the two covariances; k may differ.
     """
-    all_directions = np.zeros((len(first), len(first)))  # so that the axes below span all directions for any k
+    all_directions = np.zeros((len(first), len(first)))  # these zeros give P axes for any k
     sizes = np.maximum(np.linalg.norm(first, axis=1), np.linalg.norm(second, axis=1))
     sizes = np.where(sizes > 0, sizes, 1.0)[:, None]
     U, s, _ = np.linalg.svd(np.hstack([first / sizes, all_directions]), full_matrices=False)
@@ -181,7 +181,7 @@ def covering_root(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     # In the coordinates with the axes U s, the first covariance is the unit matrix.
     s = np.maximum(s, _NO_SPREAD * s.max())
     M = np.hstack([(U / s).T @ (second / sizes), all_directions])
-    axes, ratios, _ = np.linalg.svd(M, full_matrices=False)  # M M^T would lose the small ratios to roundoff
+    axes, ratios, _ = np.linalg.svd(M, full_matrices=False)  # roundoff would destroy the small ratios in M M^T
     return sizes * ((U * s) @ axes * np.maximum(ratios, 1.0))
 
 
@@ -198,8 +198,8 @@ def wider(estimate: Estimate, direction: np.ndarray) -> Estimate:
 
 
 def without_part(error: float, part: float) -> float:
-    """Return a standard error without one of its independent parts (difference of squares), or 0 if the part is
-    larger."""
+    """Return a standard error after one of its independent parts is subtracted (difference of squares). Return 0 if the
+    part is larger."""
     return float(np.sqrt(np.maximum(0.0, (error - part) * (error + part))))
 
 

@@ -53,10 +53,9 @@ def weighed(model: Maxwell, relaxing: float, equilibrium: float) -> Maxwell:
 def natural(u: Array) -> Maxwell:
     """Return the model from unconstrained parameters u (2N + 1,).
 
-    u contains, in this order: log G0; the logs of the ratios, each divided by the equilibrium part 1 - sum g (N,); the
-    log of the longest time. The last entries are the logs of the differences between neighbouring log times (N - 1,).
-    The softmax makes every ratio positive and the sum of the ratios smaller than 1. The positive differences make the
-    times descend.
+    u contains, in this order: log G0; log(g_i / (1 - sum g)) for the N ratios g_i; the log of the longest time; the
+    logs of the N - 1 differences between neighbouring log times. The softmax makes every ratio positive and the sum of
+    the ratios smaller than 1. The differences are positive, so the times descend.
     """
     n = (u.shape[-1] - 1) // 2
     return Maxwell(
@@ -73,7 +72,7 @@ def _softmax_shares(logits: Array) -> Array:
 
 
 #: Upper bound of the log of the difference between two log times. For larger differences the shorter time is
-#: practically 0 anyway. The bound prevents an overflow of the exponential.
+#: practically 0. The bound prevents an overflow of the exponential.
 _FARTHEST = 30.0
 
 
@@ -106,7 +105,7 @@ def residuals(u: Array, omega: Array, storage: Array, loss: Array, scales: Array
 
 def natural_fluid(u: Array) -> Maxwell:
     """Return the model without an equilibrium modulus from u (2N,). The computation is the same as in `natural`, but
-    the last mode replaces the equilibrium part."""
+    the ratio of the last mode replaces the equilibrium part."""
     n = u.shape[-1] // 2
     return Maxwell(arrays_of(u).exp(u[..., 0]), _softmax_shares(u[..., 1:n]), _times_of_gaps(u[..., n:]))
 
@@ -162,8 +161,8 @@ def spectrum(sweep: Sweep, per_decade: int = 12) -> Spectrum:
 def non_negative(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the x >= 0 for which A x is nearest to b, and the distance |A x - b|.
 
-    If relaxation times are close, columns are nearly equal, and the active-set method may cycle. Then SciPy's bounded
-    least squares is used, which always returns a result.
+    If relaxation times are close, columns of A are nearly equal, and the active-set method may cycle. Then SciPy's
+    bounded least squares is used, which always returns a result.
     """
     norm = np.linalg.norm(A, axis=0)  # with columns of equal length, the active-set method needs few iterations
     norm = np.where(norm > 0, norm, 1.0)

@@ -5,11 +5,12 @@ non-negative strength. With x = omega tau, the moduli of each term fulfil
 
     0 <= dG'/d ln(omega) <= G''      and      |dG''/d ln(omega)| <= G''
 
-because 2 x^2 / (1 + x^2)^2 <= x / (1 + x^2). If the data violate these bounds by more than their scatter, the material
-alone does not determine the data. At high frequencies, the inertia of the instrument violates the bounds: it adds a
-term to G' that grows as omega^2. This is called the mark of the instrument. At low frequencies, the transient at the
-start of the test may violate the bounds. The distance between the data and the best spectrum of any shape tests the
-whole band. This distance tests the Kramers-Kronig relation together with non-negative dissipation.
+because 2 x^2 / (1 + x^2)^2 <= x / (1 + x^2). If the data violate these bounds by more than their scatter, the data
+contain more than the response of the material. At high frequencies, the inertia of the instrument may cause a
+violation: it adds a term to G' that grows as omega^2. This violation is called the mark of the instrument. At low
+frequencies, the transient at the start of the test may cause a violation. A second check is the distance between the
+data and the best spectrum of any shape. It tests the Kramers-Kronig relation and non-negative dissipation together,
+over the whole band.
 """
 
 import math
@@ -23,14 +24,13 @@ from fitting.readers.frequency_sweep import FEWEST, Sweep, merged, scatter, some
 
 #: A violation of the bounds counts if it is larger than SIGNIFICANT (1 + _FEW_POINTS / n^2) standard deviations of the
 #: scatter, where n is the number of frequencies, and also larger than NEGLIGIBLE times the modulus. The scatter of few
-#: points is uncertain, and often too small. With this limit, fewer than 1 % of the sweeps of a constant modulus with
-#: random errors (8 to 60 frequencies) show a violation in the last half decade.
+#: points is uncertain, and often too small. With this limit, fewer than 1 % of simulated sweeps (constant modulus with
+#: random errors, 8 to 60 frequencies) show a violation in the last half decade.
 SIGNIFICANT, _FEW_POINTS, NEGLIGIBLE = 4.0, 80, 0.002
 #: A warning is given if the relative distance of the best spectrum from the data is larger than FAR, and also larger
 #: than FAR_RATIO times the scatter.
 FAR, FAR_RATIO = 0.01, 5.0
-#: The misfit is called structured if random residuals would have so few changes of sign with a probability below this
-#: value.
+#: The misfit is called structured if the probability of so few changes of sign in random residuals is below this value.
 CHANCE = 0.005
 
 
@@ -71,8 +71,8 @@ def without_instrument(sweep: Sweep, highest: float | None = None) -> Sweep:
     are moved to `grey`, and a note reports them.
 
     The search is repeated with the remaining points until the inertia is no longer found. Only the last half decade of
-    the sweep is searched. `highest`: highest frequency [rad/s] of all sweeps of a master curve. The note gives it as
-    the limit that keeps all points. None: there is only this sweep.
+    the sweep is searched. `highest`: highest frequency [rad/s] of all sweeps of a master curve. The note recommends
+    this value for --max-frequency, which keeps all points. None: there is only this sweep.
     """
     here, end = sweep, sweep.angular_frequency[-1] / math.sqrt(10)
     told = ""
@@ -136,7 +136,8 @@ def _breaches(sweep: Sweep, sizes: np.ndarray | None) -> list[str]:
 def _breach(omega: np.ndarray, storage: np.ndarray, loss: np.ndarray, limits: np.ndarray) -> str:
     """Return words that say how two neighbouring points violate a bound, or an empty string.
 
-    `limits`: largest relative errors (2, 2) of G' and of G'' (rows) at the two points that are regarded as scatter.
+    `limits`: largest relative errors (2, 2) that are regarded as scatter, of G' and of G'' (rows) at the two points
+    (columns).
     """
     step = math.log(omega[1] / omega[0])
     # Upper bound of the rise of G' between the two points, for the largest G'' that is possible between them:
@@ -193,7 +194,7 @@ def _rounded_up(hertz: float) -> float:
     return math.ceil(hertz / unit) * unit
 
 
-#: _ONE_SIDED: nearly all residuals have one sign if so many random signs would be equal with a probability below this
+#: _ONE_SIDED: nearly all residuals have one sign if the probability of so many equal signs by chance is below this
 #: value. _OUTLIERS: residuals of the rarer sign are outliers if their mean size exceeds this many times the mean size
 #: of the others.
 _ONE_SIDED, _OUTLIERS = 1e-4, 3.0
@@ -231,14 +232,14 @@ def _log_splits(n: int, parts: np.ndarray | int) -> np.ndarray:
     return np.where(low <= top, log(n) - log(low + 1) - log(np.maximum(top - low, 0) + 1), -np.inf)
 
 
-#: Words of the warning about a structured misfit. Other modules replace these words if the errors contain the misfit.
+#: Part of the warning about a structured misfit. Other modules replace this part if the errors contain the misfit.
 NOT_CONTAINED = "the standard errors do not contain it"
 
 
 def structure(omega: np.ndarray, storage: np.ndarray, loss: np.ndarray) -> tuple[dict, list[str]]:
     """Test the signs of the residuals of G' and of G'', ordered by frequency, with a runs test. Returns the results of
     the tests, and one warning if the misfit is structured. The noise of repeated measurements at one frequency may be
-    correlated, so these measurements count as one."""
+    correlated, so their residuals are averaged first."""
     numbers, told = {}, []
     omega, storage, loss = merged(omega, storage, loss)
     for name, residuals in (("storage_modulus", storage), ("loss_modulus", loss)):

@@ -24,7 +24,7 @@ class Solution(NamedTuple):
     jacobian: Array
     cost: Array
     iterations: Array
-    gradient: Array  # largest cosine between the residuals and a column of the Jacobian
+    gradient: Array  # largest |cosine| of the angles between the residuals and the columns of the Jacobian
     converged: Array
 
 
@@ -197,7 +197,8 @@ def from_starts(evaluate: Evaluate, starts: np.ndarray, *data: Any, max_iteratio
         max_iterations: maximum number of iterations of each search; `LONGER` times as many for the search with the
             lowest cost.
     """
-    # The matrices are small. With several threads, their decomposition took 50 times as long while other programs ran.
+    # The matrices are small. While other programs ran, their decomposition took 50 times as long with several threads
+    # as with one.
     with one_blas_thread():
         found = _best_minimum(evaluate, starts, data, max_iterations)
         if found.converged or found.iterations < max_iterations:

@@ -6,7 +6,7 @@ maximum likelihood. The interval of mu follows Hartung and Knapp (2001), Statist
 new sample uses Student's t with n - 1 degrees of freedom. This interval is exact if the errors e_i are small. (Higgins,
 Thompson and Spiegelhalter (2009), J. R. Stat. Soc. A 172, use n - 2.) If the errors e_i are so large that s is
 uncertain, a second interval is computed as an average over all possible s. Then the interval of a new sample is
-extended until it contains both.
+extended until it contains both intervals.
 
 The values of the samples are moved towards the mean (shrinkage). Few samples determine s poorly, so the moved values
 are averages over all possible s. The weight of each s is the restricted likelihood times a half-Cauchy prior of scale 1
@@ -29,13 +29,13 @@ EVEN = 0.8
 #: If the mean variance of the errors, divided by the variance between samples, exceeds this value, the estimated
 #: variance between samples is not reliable.
 UNSURE = 0.25
-#: If the data of a sample do not determine its value, and this value is below this fraction of the mean, the sample is
-#: not part of the population.
+#: A sample is not part of the population if its data do not determine its value, and the fitted value is below this
+#: fraction of the mean.
 BELOW = 1e-3
 #: A value with an additive error is near 0 if it is below three times its error, and below this fraction of the median.
 NEAR_ZERO = 0.1
-#: A value near 0 is part of the population only if it may be larger than `NEAR_ZERO` times the median, or if its error,
-#: divided by the median, exceeds this value.
+#: A value near 0 is part of the population only if it may be larger than `NEAR_ZERO` times the median (within two
+#: errors), or if its error, divided by the median, exceeds this value.
 MAY_BE_ZERO = 0.2
 #: Largest number of rounds in which the moved values and the population are computed in turn.
 ROUNDS_OF_MOVING = 50
@@ -107,8 +107,8 @@ def population(values: np.ndarray, errors: np.ndarray, additive: bool = False) -
 def _with_errors_of_zeros(values: np.ndarray, errors: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Return the errors (n,) of values with additive errors. The error is infinite if a value is not used.
 
-    A value of 0 has no error of its own. So it gets the median error of the values that are `known`. A value near 0 is
-    used only if its error is so large that a sample of this population may have this value. Otherwise, the sample is of
+    A value of 0 without a finite error gets the median error of the values that are `known`. A value near 0 is used
+    only if its error is so large that a sample of this population may have this value. Otherwise, the sample is of
     another material."""
     clear = known & (values > 2 * errors)
     typical = min(np.median(values[part]) for part in (known, clear) if part.any())
@@ -134,7 +134,7 @@ def _as_logarithms(values: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, 
         step = mean + variance / (variance + v) * (y - mean) - at
         if np.max(np.abs(step)) < 1e-6:
             break
-        at = at + step / 2  # whole steps may alternate between two populations
+        at = at + step / 2  # with whole steps, the iteration may alternate between two populations
     return y, v
 
 

@@ -158,8 +158,8 @@ def moduli_of_logarithms(u: Array, omega: np.ndarray, times: np.ndarray, solid: 
 
 
 def _restricted_likelihood(x: np.ndarray, A: np.ndarray, r: np.ndarray, L: np.ndarray) -> float:
-    """Return -2 log of the restricted likelihood, up to a constant. The penalty L (rows, columns) leaves columns - rows
-    parameters without a prior."""
+    """Return -2 log of the restricted likelihood, up to a constant. The matrix L of the penalty has fewer rows than
+    columns. The difference is the number of parameters without a prior."""
     square = max(float(r @ r + np.sum((L @ x) ** 2)), 1e-300)
     with np.errstate(divide="ignore"):
         both = 2 * np.sum(np.log(np.abs(np.diag(np.linalg.qr(np.vstack([A, L]), mode="r")))))

@@ -72,7 +72,7 @@ def equilibrium_error(u: Estimate) -> float:
     return float(np.linalg.norm(slope @ u.root)) if rest > NO_REST else np.inf
 
 
-#: If the equilibrium modulus of a solid is below this part of G0, the solid is compared with a fluid.
+#: If the equilibrium modulus of a solid is below this fraction of G0, the solid is compared with a fluid.
 _SOFT = 0.01
 
 
@@ -119,8 +119,8 @@ def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, poin
 
     The likelihood contains only noise of the same relative size in G' and G''. If `uncertainty` has errors of the gap
     or the instrument too, or larger errors of the noise, these errors widen the interval. The squares of both half
-    widths are added. If the noise in `uncertainty` gives a smaller error (for example because G' has more noise than
-    G''), the interval is shortened by this ratio. Both changes are right to first order.
+    widths are added. If `uncertainty` has a smaller error of the noise (for example because G' has more noise than
+    G''), the half widths are multiplied by the ratio of both errors. Both changes are right to first order.
 
     Returns:
         [low, high] for each name. An end is None if the likelihood does not fall to the limit of the interval within
@@ -171,7 +171,7 @@ def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, poin
 
 def _farther(end: float | None, center: float, ratio: float, half: float) -> float | None:
     """Return the end of an interval around `center`, if its distance from the center is multiplied by `ratio` and one
-    more independent error is added. `half`: half width of the interval of this error alone."""
+    more independent error is added. `half`: half width of the interval that this error alone gives."""
     if end is None:
         return None
     return float(center + np.copysign(np.hypot(ratio * (end - center), half), end - center))

@@ -1,4 +1,4 @@
-"""The base line of a sensor: its response in the rows before the load, a constant offset or a steady drift."""
+"""The base line of a sensor, found from the rows before the load: a constant offset or a steady drift."""
 
 from typing import NamedTuple
 
@@ -7,12 +7,12 @@ import numpy as np
 #: Minimum number of rows at rest that can show an offset or a drift. A base line is ignored if it changes no response
 #: by more than OFFSET times the largest response.
 RESTING, DRIFTING, OFFSET = 3, 10, 0.003
-#: A drift is possible, or clear, above these numbers of its standard errors. The limit for an offset is 3.
+#: A drift counts as possible, or clear, above these numbers of standard errors. The limit for an offset is 3.
 _POSSIBLE, _CLEAR = 2.5, 4.0
 #: A drift is continued under load only if the rows at rest last at least _LONG times as long as the load, and if it
-#: changes no response by more than _LARGE times the largest one.
+#: changes no response by more than _LARGE times the largest response.
 _LONG, _LARGE = 0.2, 0.3
-#: The error of a drift is at least this fraction of it, because nothing shows how it continues under load.
+#: The error of a drift is at least this fraction of the drift, because no row shows how it continues under load.
 _CONTINUED = 0.5
 #: The estimated correlation between neighbouring responses is at most this number.
 _MOST_ALIKE = 0.95
@@ -25,7 +25,7 @@ class BaseLine(NamedTuple):
     level_error: float
     slope: float = 0.0  # per second
     slope_error: float = 0.0
-    left: float = 0.0  # slope of the rows at rest that is not subtracted, because it may not continue
+    left: float = 0.0  # drift of the rows at rest that is not subtracted, because it may end
 
 
 def base_line(time: np.ndarray, answer: np.ndarray, size: float, end: float, rounding: float = 0.0) -> BaseLine | None:
@@ -37,8 +37,8 @@ def base_line(time: np.ndarray, answer: np.ndarray, size: float, end: float, rou
         answer: their responses (n,).
         size: the largest response of the whole test.
         end: time [s] of the last response of the test.
-        rounding: standard deviation of the rounding errors of these responses. A mean of equal responses still has this
-            error.
+        rounding: standard deviation of the rounding errors of these responses. Even the mean of equal responses has
+            this error.
     """
     if len(time) < RESTING:
         return None
@@ -61,16 +61,17 @@ def base_line(time: np.ndarray, answer: np.ndarray, size: float, end: float, rou
     if steady and small and rest > _LONG * end and clear:
         return BaseLine(level, max(level_error, rounding), slope, max(slope_error, _CONTINUED * abs(slope)))
     error = max(error, 0.5 * abs(slope) * rest)
-    if steady and small:  # the whole drift is an error
+    if steady and small:  # the whole drift counts as error
         return BaseLine(mean, error, slope_error=abs(slope), left=slope)
     return BaseLine(mean, error, left=slope) if clear or error > OFFSET * size else flat
 
 
 def _mean_at_rest(answer: np.ndarray) -> tuple[float, float]:
     """Return the mean of responses (n,) and its standard error. The error contains the correlation between neighbouring
-    responses. An estimate r of this correlation is too small by about (1 + 4 r) / n, and this is corrected. n responses
-    cannot show how strong a correlation above 1 - 2 / n is. With this limit, the error is at most the scatter of the
-    responses. If the correlation is strong and n is 20 or less, the error is still too small."""
+    responses. An estimate r of this correlation is too small by about (1 + 4 r) / n; this bias is corrected. The
+    correlation is limited to 1 - 2 / n, because n responses cannot determine a stronger one. With this limit, the error
+    is at most the scatter of the responses. If the correlation is strong and n is 20 or less, the error is still too
+    small."""
     n, mean = len(answer), float(np.mean(answer))
     r = _neighbours_alike(answer - mean)
     alike = min(max(r + (1 + 4 * r) / n, 0.0), _MOST_ALIKE, 1 - 2 / n)
@@ -84,8 +85,8 @@ def _neighbours_alike(off: np.ndarray) -> float:
 
 
 def _straight_line(time: np.ndarray, answer: np.ndarray) -> tuple[float, float, float, float]:
-    """Return value at time 0 and slope of the straight line through responses (n,), and their two standard errors. The
-    errors contain the correlation between neighbouring responses."""
+    """Fit a straight line to responses (n,). Return its value at time 0, its slope, and the standard errors of both.
+    The errors contain the correlation between neighbouring responses."""
     A = np.column_stack([np.ones(len(time)), time])
     found = np.linalg.lstsq(A, answer, rcond=None)[0]
     off = answer - A @ found

@@ -7,20 +7,21 @@ import numpy as np
 
 from fitting.readers.noise_of_series import noise_of_series
 
-#: The load is replaced by straight parts. It differs from them by at most _CLOSE times its largest value, or by
-#: _OF_SCATTER standard deviations of its scatter if this is more, but by at most _LOOSE times its largest value.
+#: The load is replaced by straight parts. The allowed difference is _CLOSE times the largest load or _OF_SCATTER
+#: standard deviations of the scatter, whichever is larger, but at most _LOOSE times the largest load.
 _CLOSE, _OF_SCATTER, _LOOSE = 0.01, 4.0, 0.1
 #: Changes of the load below _LEAST_CHANGE times its largest value do not count.
 _LEAST_CHANGE = 0.05
-#: A change of the load begins where the load changes more than _FASTER times as much as in an equal time before.
+#: A change of the load begins where the load changes more than _FASTER times as much as in the same length of time
+#: before.
 _FASTER = 10.0
 #: Rows count as equally far from a straight part if their distances are above _NEARLY times the largest distance. The
 #: search for corners ends after _PASSES passes. This limit is reached only with thousands of irregular cycles.
 _NEARLY, _PASSES = 0.99, 60
 #: The numbers of straight parts of two columns are compared if the smaller number is at most _MOST_PARTS. A column is
-#: smoother than another one if its noise is smaller by the factor _SMOOTHER.
+#: smoother than the other column if its noise is smaller by the factor _SMOOTHER.
 _MOST_PARTS, _SMOOTHER = 50, 1.5
-#: In the second half, a column is constant beside another one if the other one changes more by the factor _MOVES.
+#: A column counts as constant in the second half only if the other column changes more by the factor _MOVES.
 _MOVES = 3.0
 
 
@@ -29,12 +30,13 @@ def first_is_imposed(time: np.ndarray, first: np.ndarray, second: np.ndarray) ->
 
     If only one column is constant in the second half, it is imposed. Otherwise, the imposed quantity is often constant
     or linear in parts. So it has fewer straight parts than the response. In long smooth cycles, the
-    imposed quantity has less noise. If this does not decide, it is the one that changes less in the second half."""
+    imposed quantity has less noise. If these rules do not decide, the imposed quantity is the column that changes less
+    in the second half."""
     late, both = len(time) // 2, (first, second)
     moves = [float(np.ptp(v[late:])) / max(float(np.max(np.abs(v))), 1e-300) for v in both]
     if min(moves) < _LEAST_CHANGE and max(moves) > _MOVES * min(moves):
         return moves[0] < moves[1]
-    # Columns with the range 1. For a column without changes, any scale is right.
+    # Scale the columns to the range 1. A constant column needs no scale.
     scaled = [v / (float(np.ptp(v)) or 1.0) for v in both]
     noise = [noise_of_series(v) for v in scaled]
     allowed = float(np.clip(_OF_SCATTER * max(noise), _CLOSE, _LOOSE))
@@ -74,8 +76,8 @@ def _begins_of_kept(times: bytes, loads: bytes, begun: float) -> np.ndarray:
 
 def _corners_of_load(time: np.ndarray, driven: np.ndarray, allowed: float) -> np.ndarray:
     """Return the indices (c,) of the first and the last row and of corners between them. Straight lines between these
-    rows differ from the load by at most `allowed`. In each part, the row farthest from the line is the next corner; of
-    several such rows, the one in the middle."""
+    rows differ from the load by at most `allowed`. In each part, the row farthest from the line is the next corner; if
+    several rows are equally far, the middle row."""
     corners, rows = np.array([0, len(time) - 1]), np.arange(len(time))
     for _ in range(_PASSES):
         off = np.abs(driven - np.interp(time, time[corners], driven[corners]))

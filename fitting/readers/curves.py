@@ -36,15 +36,15 @@ class Curve(NamedTuple):
     F: np.ndarray  # (n, 3, 3) deformation gradient, det F = 1; face 3 is free of stress
     component: tuple[int, int]  # indices of the measured component of the nominal stress, from 0
     stress: np.ndarray  # (n,) [Pa]
-    returns: int = 0  # how often the deformation reverses and repeats earlier deformations
+    returns: int = 0  # number of reversals after which the deformation repeats earlier values
     sample: str = ""  # name of the sample, the same for all components of one test; if empty, `label`
     law_scale: float | None = None  # [Pa] root mean square of the stress of a fitted law; None: no law is fitted
-    file: str = ""  # path of the file, whose tests may all belong to one sample
+    file: str = ""  # path of the file; all tests of a file may belong to one sample
 
     @property
     def driven(self) -> np.ndarray:
-        """Component (n,) of F on which the measured stress does work. If this component is constant, the shear F12. If
-        F12 is constant too, the stretch F11."""
+        """Component (n,) of F on which the measured stress does work. If this component is constant, F12 is used. If
+        F12 is constant too, F11 is used."""
         own, shear = self.F[:, *self.component], self.F[:, 0, 1]
         return own if np.ptp(own) > 0 else shear if np.ptp(shear) > 0 else self.F[:, 0, 0]
 
@@ -97,11 +97,11 @@ def check_curves(curves: list[Curve]) -> None:
 def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[str]]:
     """Read the stress-stretch curves of CSV files. Return the curves, and notes for the user.
 
-    A file has one of two forms. In both, `#` begins a comment. In the first form, the columns are F11 … F33 and P11 …
-    P33 (deformation gradient and nominal stress). Here a stress that is zero in all rows counts as not measured. In the
-    second form, the columns are `test`, `stretch`, `shear` and `nominal_stress_kPa`, and `test` is one of uniaxial,
-    equibiaxial, pure_shear, simple_shear. The name of a stress column may end in _Pa, _kPa or _MPa. Otherwise the
-    stress is in `unit`.
+    A file has one of two forms. In both forms, `#` begins a comment. In the first form, the columns are F11 … F33 and
+    P11 … P33 (deformation gradient and nominal stress). In this form, a stress that is zero in all rows counts as not
+    measured. In the second form, the columns are `test`, `stretch`, `shear` and `nominal_stress_kPa`, and `test` is one
+    of uniaxial, equibiaxial, pure_shear, simple_shear. The name of a stress column may end in _Pa, _kPa or _MPa.
+    Otherwise the stress is in `unit`.
 
     Raises:
         InputError: the file or a column does not exist, a value is not a number, the volume changes, or there are too
@@ -249,7 +249,8 @@ def _names_curves(headings: list[str]) -> bool:
 
 
 def _of_strains(headings: list[str]) -> str:
-    """Return words for the end of a message: how a column of strains, if there is one, becomes a column `stretch`."""
+    """Return the end of a message: how to convert a column of strains to stretches; empty if there is no such
+    column."""
     strain = next((name for name in headings if _STRAIN.match(name)), None)
     if strain is None:
         return ""
@@ -299,8 +300,8 @@ def _stress_column(file: Path, row: dict, pattern: str, unit: str) -> tuple[str,
     return (found[0][0], STRESS_UNITS[found[0][1] or unit], found[0][1] is not None) if found else None
 
 
-#: A stress component below this fraction of the largest component was not measured. Programs write roundoff instead of
-#: 0, some of them in single precision.
+#: A stress component below this fraction of the largest component counts as not measured. Programs write roundoff
+#: instead of 0, some of them in single precision.
 ROUNDOFF = 1e-5
 
 
@@ -463,8 +464,8 @@ def _returns(driven: np.ndarray, F: np.ndarray) -> int:
 
     Args:
         driven: (n,) the component of the deformation that the test changes.
-        F: (n, 9) all components. Rows with the same `driven` but other components do not count as a repetition, for
-            example in biaxial tests with several stretch ratios.
+        F: (n, 9) all components. Rows with the same `driven` but different other components do not count as a
+            repetition, for example in biaxial tests with several stretch ratios.
     """
     turns, low, high, least = [0], 0, 0, _TURN * np.ptp(driven)
     rises: bool | None = None

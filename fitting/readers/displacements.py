@@ -19,7 +19,7 @@ _FAR = 2.0
 #: At most the fraction _MOST_OUTSIDE of all points may lie outside of the mesh by more than _OUTSIDE element sizes.
 #: Such points occur near a surface with a coarse mesh.
 _OUTSIDE, _MOST_OUTSIDE = 0.25, 0.2
-#: A displacement above this value times the size of the body is an error in the file.
+#: A displacement that exceeds this value times the size of the body must be an error in the file.
 _LONGEST = 2.0
 _COLUMNS = ("node", "x", "y", "z", "ux", "uy", "uz", "time", "sd")
 
@@ -44,8 +44,8 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
 
     The columns are: ``node`` (index of the node in `scene.mesh`, from 0), or ``x, y, z`` (position at rest); ``ux, uy,
     uz`` (empty if not measured); ``time`` [s], if the scene has time steps (default: the last step); ``sd``, the
-    standard deviation of the noise. `#` begins a comment. `liverjax.mesh.files.read_mesh` states when the indices of
-    the nodes differ from those in the mesh file. Then give ``x, y, z``.
+    standard deviation of the noise. `#` begins a comment. The indices of the nodes may differ from the indices in the
+    mesh file, see `liverjax.mesh.files.read_mesh`: give ``x, y, z`` in this case.
 
     Args:
         path: CSV file.
@@ -97,7 +97,7 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
 
 
 def _deviations_of_noise(path: Path, own: np.ndarray | None, noise: float | None, n: int) -> np.ndarray:
-    """Return the standard deviations (n,) [m] of the noise: those of the file (`own`), or else `noise` for all rows."""
+    """Return the standard deviations (n,) [m] of the noise: the file's column (`own`), or else `noise` for all rows."""
     if own is None and noise is None:
         raise InputError(
             f"{path}: the column sd is missing; add this column, or give the noise's standard deviation in metres "
@@ -234,8 +234,8 @@ def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 40) -> tuple[np.
     best = np.argmax(bary.min(axis=-1), axis=1)
     row = np.arange(len(points))
     element, weights = near[row, best], bary[row, best]
-    # If the sizes of the elements differ much, the right element may have none of the nearest centres. So all elements
-    # whose bounding box, enlarged by a tenth, contains the point are searched too.
+    # If the sizes of the elements differ much, the centre of the right element may not be among the nearest centres. So
+    # all elements whose bounding box, enlarged by a tenth, contains the point are searched too.
     low, high = X[tets].min(axis=1), X[tets].max(axis=1)
     low, high = low - 0.1 * (high - low), high + 0.1 * (high - low)
     for k in np.flatnonzero(weights.min(axis=-1) < 0):

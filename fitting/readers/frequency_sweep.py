@@ -14,8 +14,9 @@ from liverjax.core.struct import Content
 
 #: Minimum number of frequencies that must remain if points are ignored.
 FEWEST = 3
-#: Given standard deviations are the spread between samples, not noise, if they exceed LARGE times the moduli and also
-#: SHARED times the scatter of the points. If these deviations were noise, the points would scatter just as much.
+#: Given standard deviations are regarded as the spread between samples, not as noise, if they exceed LARGE times the
+#: moduli and also SHARED times the scatter of the points. If these deviations were noise, the points would scatter just
+#: as much.
 SHARED, LARGE = 3.0, 0.1
 
 
@@ -60,7 +61,7 @@ class Sweep(NamedTuple):
 
     @property
     def tensile(self) -> bool:
-        """Whether E' and E'' were measured, in tension or bending. `storage` and `loss` are then a third of them."""
+        """Whether E' and E'' were measured, in tension or bending. Then `storage` is E' / 3 and `loss` is E'' / 3."""
         return self.load != "shear"
 
     @property
@@ -165,9 +166,9 @@ def distances_from_polynomials(x: np.ndarray, y: np.ndarray, m: int) -> np.ndarr
 #: Points whose logarithms of x differ by less than _NEAR are merged into one point of the smooth curve. The curve needs
 #: at least _PLACES such points, and has at most about _MOST.
 _NEAR, _PLACES, _MOST = 0.01, 5, 400
-#: A point is far from its neighbours if its logarithm differs from their median by more than _FAR, and also by more
-#: than _DEVIATIONS robust standard deviations. The curve is fitted without such points. The same two limits determine
-#: which points are far above the fitted curve.
+#: A point is far from its neighbours if its logarithm differs from the median of the five logarithms around it by more
+#: than _FAR, and also by more than _DEVIATIONS robust standard deviations. The curve is fitted without such points. The
+#: same two limits determine which points are far above the fitted curve.
 _FAR, _DEVIATIONS = 0.4, 5.0
 
 
@@ -176,15 +177,15 @@ def smooth_curve(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
     The curve is a spline of the logarithms, smoothed by cross-validation. Residuals are divided by the curve, so they
     are relative. If the residuals were divided by the measured values, a point that is low by chance would have more
-    weight than a point that is high. The fit would then be too low by twice the square of the relative noise. A value
-    far above the curve is returned as it is, so that this wrong point does not dominate the fit.
+    weight than a point that is high. The fit would then be too low by twice the square of the relative noise. At a
+    point far above the curve, the measured value is returned, so that this wrong point does not dominate the fit.
     """
     return _curve_of_bytes(np.asarray(x, float).tobytes(), np.asarray(y, float).tobytes())
 
 
 @lru_cache(maxsize=256)  # a fit uses the weights of the same sweep many times
 def _curve_of_bytes(*columns: bytes) -> np.ndarray:
-    """Compute `smooth_curve` from the bytes of its columns."""
+    """Compute `smooth_curve`. The columns are given as bytes, because the cache needs hashable arguments."""
     from scipy.interpolate import make_smoothing_spline
 
     x, y = (np.frombuffer(column) for column in columns)
@@ -221,9 +222,9 @@ def _far_from_neighbours(y: np.ndarray) -> np.ndarray:
     return off > max(_FAR, _DEVIATIONS * 1.4826 * float(np.median(off)))
 
 
-#: Standard deviations come from few repeats if ln(deviation / modulus) scatters about a smooth curve by more than
-#: _FEW_REPEATS. Five repeats give a scatter of 0.4, three repeats 0.64. With _POINTS points or more, a polynomial of
-#: degree _DEGREE replaces such deviations.
+#: Standard deviations count as results of few repeats if ln(deviation / modulus) scatters about a smooth curve by more
+#: than _FEW_REPEATS. Five repeats give a scatter of 0.4, three repeats 0.64. With _POINTS points or more, a polynomial
+#: of degree _DEGREE replaces such deviations.
 _FEW_REPEATS, _POINTS, _DEGREE = 0.25, 8, 2
 #: If ln(deviation / modulus) varies by less than this, the deviations are a fixed percentage of the moduli.
 _ROUNDED = 0.01
@@ -236,7 +237,7 @@ def deviations_of_sweeps(omega: np.ndarray, modulus: np.ndarray, sd: np.ndarray,
 
     Each sweep with `_POINTS` or more frequencies is smoothed separately. A shorter sweep has too few points for this,
     so all shorter sweeps are smoothed together, after a division by the level of each sweep (`_levels_of_sweeps`). If
-    their deviations are smooth in each sweep already, they are not changed.
+    the deviations of the shorter sweeps are already smooth in each sweep, they are not changed.
     """
     out, short = np.empty(len(omega)), np.zeros(len(omega), bool)
     for k in np.unique(numbers):
@@ -257,8 +258,9 @@ def deviations_of_sweeps(omega: np.ndarray, modulus: np.ndarray, sd: np.ndarray,
 
 def _smooth_in_sweeps(x: np.ndarray, part: np.ndarray, numbers: np.ndarray) -> bool:
     """Return whether relative standard deviations follow the same parabola over the frequency in each sweep, apart from
-    the level of the sweep. If they are a fixed percentage in each sweep, the result is False, because this percentage
-    belongs to moduli with noise. `x`, `part`: logarithms (n,) of the frequency and of the relative deviations."""
+    a factor for each sweep. If they are a fixed percentage in each sweep, the result is False, because they then
+    contain the noise of the measured moduli. `x`, `part`: logarithms (n,) of the frequency and of the relative
+    deviations."""
     place = np.unique(numbers, return_inverse=True)[1]
     count = np.bincount(place)
     u = x - (np.bincount(place, x) / count)[place]
@@ -272,8 +274,9 @@ def _smooth_in_sweeps(x: np.ndarray, part: np.ndarray, numbers: np.ndarray) -> b
 
 
 def _levels_of_sweeps(part: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-    """Return the level (n,) of the relative standard deviations in the sweep of each point. All levels are 1 if the
-    sweeps do not differ more than by chance (F-test). `part`: logarithms (n,) of the relative standard deviations."""
+    """Return for each point the level (n,) of its sweep: the geometric mean of its relative standard deviations,
+    divided by the geometric mean of all sweeps. All levels are 1 if the sweeps do not differ more than by chance
+    (F-test). `part`: logarithms (n,) of the relative standard deviations."""
     place = np.unique(numbers, return_inverse=True)[1]
     means = (np.bincount(place, part) / np.bincount(place))[place]
     more, freedom = int(place.max()), len(part) - int(place.max()) - 1
@@ -296,7 +299,7 @@ def smooth_deviations(omega: np.ndarray, modulus: np.ndarray, sd: np.ndarray) ->
 
 @lru_cache(maxsize=256)  # a fit uses the weights of the same sweep many times
 def _smooth_of_bytes(*columns: bytes) -> np.ndarray:
-    """Compute `smooth_deviations` from the bytes of its columns."""
+    """Compute `smooth_deviations`. The columns are given as bytes, because the cache needs hashable arguments."""
     omega, modulus, sd = (np.frombuffer(column) for column in columns)
     x, part, curve = np.log(omega), np.log(sd / modulus), smooth_curve(omega, modulus)
     at, of_modulus, of_sd = merged(x, part, np.log(sd))
@@ -321,12 +324,12 @@ def merged(omega: np.ndarray, *columns: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def mostly_repeated(omega: np.ndarray) -> bool:
-    """Return whether most of the different frequencies occur several times: their median number is 2 or more."""
+    """Return whether most frequencies occur several times: the median number of points per frequency is 2 or more."""
     return bool(np.median(np.unique(omega, return_counts=True)[1]) >= 2)
 
 
 def within(sweep: Sweep, low: float | None, high: float | None, fewest: int = FEWEST) -> Sweep:
-    """Return the sweep with only the points from `low` to `high` [Hz]. A note reports how many points are ignored.
+    """Return the sweep with only the points from `low` to `high` [Hz]. A note reports the number of ignored points.
 
     Raises:
         InputError: fewer than `fewest` frequencies remain.
@@ -375,8 +378,8 @@ def without_copies(sweep: Sweep) -> Sweep:
 
 
 def with_friction(sweep: Sweep, error: float, radius: float, height: float) -> Sweep:
-    """Return the sweep with its fields `friction` and `friction_error`. `error` [N m s] is the standard deviation of
-    the friction of the instrument's bearing; `radius` and `height` of the sample are in m.
+    """Return the sweep with new values of the fields `friction` and `friction_error`. `error` [N m s] is the standard
+    deviation of the friction of the instrument's bearing; `radius` and `height` of the sample are in m.
 
     Raises:
         InputError: the moduli are of tension or bending.
@@ -450,7 +453,7 @@ def without_inertia(
 
 
 def _points_without_raw_values(raw: dict[str, np.ndarray]) -> str:
-    """Return words on the points without a value in one of the raw columns. Empty if there are no such points."""
+    """Return words about the points without a value in one of the raw columns, or an empty string."""
     known = raw_torque.with_raw_columns(raw)
     if known.all():
         return ""

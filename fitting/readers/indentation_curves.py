@@ -131,7 +131,7 @@ def _points_of_hold(values: np.ndarray) -> int:
     """Return the number of points at the end at which depth or force stays at its largest value; 0 if it still rises.
 
     Because of noise, a rising quantity comes near its largest value long before the end. So these points count as a
-    hold only if the rise within them is below half of the rise before them by more than twice the noise.
+    hold only if they rise much less than the points before: by less than half of this rise minus twice the noise.
     """
     reached = int(np.argmax(values >= np.max(values) - _margin(values))) + 1
     held = len(values) - reached
@@ -214,8 +214,7 @@ def _words_of_heading(cell: str) -> list[str]:
 
 
 def _place_among_words(cell: str, quantity: str) -> int | None:
-    """Return the place in `_WORDS` of the word with which a heading begins, or None if the heading names another
-    quantity."""
+    """Return the index in `_WORDS` of the first word of a heading, or None if the heading names another quantity."""
     if _NOT & {w.lower() for w in _words_of_heading(cell)}:
         return None
     return next((k for k, word in enumerate(_WORDS[quantity]) if cell.lower().lstrip('# "').startswith(word)), None)

@@ -2,14 +2,15 @@
 
 import numpy as np
 
-#: A single value is far from its neighbours if its distance from them exceeds three limits: _FAR times the changes
+#: A single value is far from its neighbours if its distance from both exceeds three limits: _FAR times the changes
 #: beside it, _NOISES times the noise, and _OF_LARGEST times the largest value.
 _FAR, _NOISES, _OF_LARGEST = 10.0, 20.0, 0.02
 _LOW = 0.5
 #: Sizes are smoothed over _WINDOW values. A size is not smoothed if its distance from the smooth size exceeds two
-#: limits: the first number of _OFF_LINE times the size, and the second times the robust deviation of all distances.
+#: limits: the first number of _OFF_LINE times the size, and the second number times the robust standard deviation of
+#: all distances.
 _WINDOW, _OFF_LINE = 11, (0.2, 5.0)
-#: Two values are the same if they differ by less than this fraction of the largest value.
+#: Two values count as the same if they differ by less than this fraction of the largest value.
 _SAME = 1e-9
 #: A series counts as rounded if at least this fraction of its neighbouring values are the same.
 _OFTEN_SAME = 0.25
@@ -27,7 +28,7 @@ def noise_of_series(values: np.ndarray) -> float:
 
 def rounding_of_series(values: np.ndarray) -> float:
     """Return the standard deviation of the rounding errors of a series (n,): the smallest change between neighbouring
-    values, divided by the root of 12. Returns 0 if few neighbouring values are the same (see `_OFTEN_SAME`).
+    values, divided by the square root of 12. Returns 0 if few neighbouring values are the same (see `_OFTEN_SAME`).
 
     If most values are the same because of rounding, `noise_of_series` is 0.
     """
@@ -39,9 +40,10 @@ def rounding_of_series(values: np.ndarray) -> float:
 
 
 def rounding_at_rest(values: np.ndarray, whole: np.ndarray) -> float:
-    """Return the standard deviation of the rounding errors of the values (n,) of a sensor at rest, which may all be the
-    same: the smallest difference between the values `whole` (m,) of the complete test, divided by the root of 12.
-    Returns 0 if few neighbouring values at rest are the same (see `_OFTEN_SAME`)."""
+    """Return the standard deviation of the rounding errors of a sensor at rest with the values (n,). Because these
+    values may all be the same, the result is the smallest difference between the values `whole` (m,) of the complete
+    test, divided by the square root of 12. Returns 0 if few neighbouring values at rest are the same (see
+    `_OFTEN_SAME`)."""
     least = _SAME * np.abs(whole).max(initial=0.0)
     gaps = np.diff(np.sort(whole))
     if len(values) < 2 or np.mean(np.abs(np.diff(values)) <= least) < _OFTEN_SAME or not np.any(gaps > least):
@@ -53,7 +55,7 @@ def sizes_of_series(values: np.ndarray) -> np.ndarray:
     """Return the absolute values (n,). A value below `_LOW` times the median of itself and its neighbours is replaced
     by this median.
 
-    With these sizes as scales of the residuals, a single value near 0 has no larger weight than its neighbours.
+    If these sizes are the scales of the residuals, a single value near 0 has no larger weight than its neighbours.
     """
     from scipy.ndimage import median_filter
 
@@ -95,7 +97,8 @@ def far_values(values: np.ndarray) -> np.ndarray:
 
 def off_the_line(values: np.ndarray) -> np.ndarray:
     """Return the indices of single values that lie far from the line between their neighbours. Unlike `far_values`, the
-    values (n,) may rise steeply. A corner or a jump of the series has another pattern of second differences."""
+    values (n,) may rise steeply. Corners and jumps of the series are not found, because their second differences have
+    another pattern."""
     if len(values) < 7:
         return np.zeros(0, int)
     off = values[1:-1] - 0.5 * (values[:-2] + values[2:])

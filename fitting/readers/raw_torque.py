@@ -55,7 +55,7 @@ def known_columns(cells: list[str], units: list[str]) -> dict[str, tuple[int, fl
 
 
 def unit_of(quantity: str, cells: list[str], units: list[str]) -> str:
-    """Return the unit of a quantity, from its heading or from the line of units. Empty if neither states the unit."""
+    """Return the unit of a quantity from its heading or the line of units, or an empty string if both have no unit."""
     return _places_and_units(cells, units).get(quantity, (0, ""))[1]
 
 
@@ -107,7 +107,7 @@ def share(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray], geometry
 
     Args:
         omega: (n,) [rad/s].
-        G: complex modulus (n,) [Pa], as corrected by the instrument.
+        G: complex modulus (n,) [Pa] after the instrument's correction of the inertia.
         raw: columns (n,) in SI units: torque and angle; phase and sample_torque if the file has them.
         geometry: K [m^3], the torque per Pa and rad. It is needed if there is no sample_torque.
     """
@@ -160,7 +160,8 @@ def share_by_phase(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray])
 
 #: _FEWEST_LED: minimum number of different frequencies whose inertias are compared. _WIDTH_LED: minimum ratio of the
 #: highest to the lowest of these frequencies, if the sweep is wide enough. If the raw columns contain no inertia and no
-#: phase, the root that `share` uses is 2 K G' / omega^2. At frequencies that differ by less, it would seem constant.
+#: phase, the root that `share` uses is 2 K G' / omega^2. If the frequencies differed by less, this root would seem to
+#: be a constant inertia.
 _FEWEST_LED, _WIDTH_LED = 3, 1.1
 
 

@@ -63,7 +63,7 @@ def read_all_sweeps(path: str | os.PathLike) -> list[tuple[str, Sweep]]:
     return [(table.name, _sweep(str(path), table, [])) for table in tables]
 
 
-#: Standard deviations are not used if they are missing or unusable at more than this part of the usable points [1]. If
+#: Standard deviations are not used if they are missing or unusable at more than this fraction of the usable points. If
 #: they are unusable at fewer points, these points are ignored.
 WITHOUT_SD = 0.25
 

@@ -27,8 +27,9 @@ AT_REST = 0.01
 #: LEAST_SIZE times the largest response.
 RELATIVE, CYCLIC, LEAST_SIZE = 0.03, 0.1, 1e-6
 
-#: How the load changed where no row shows it. BETWEEN_ROWS: unknown; a linear change between rows is assumed.
-#: BEFORE_ROWS: unknown; the first row is already loaded, so a row at 0 s was added. GIVEN: the user gave the duration.
+#: What is known about a change of the load that no row shows. BETWEEN_ROWS: unknown; a linear change between rows is
+#: assumed. BEFORE_ROWS: unknown; the first row is already loaded, so a row at 0 s was added. GIVEN: the user gave the
+#: duration.
 BETWEEN_ROWS, BEFORE_ROWS, GIVEN = "between rows", "before the rows", "given"
 
 
@@ -43,7 +44,7 @@ class TimeTest(NamedTuple):
     source: str = ""
     notes: tuple[str, ...] = ()
     constant_noise: bool = False  # whether the noise of all responses has the same size
-    rise: str = BETWEEN_ROWS  # how the load changed where no row shows it
+    rise: str = BETWEEN_ROWS  # what is known about a change of the load that no row shows
     described: bool = False  # whether a TOML file describes the test
     # Standard errors of the subtracted base line of the sensor, in the unit of the response: error at the beginning of
     # the load, and error of the change per second.
@@ -52,7 +53,7 @@ class TimeTest(NamedTuple):
     # Standard deviation of the rounding errors of the responses, 0 if they are not rounded. It is found before the base
     # line is subtracted, because rows with the same response differ after a drift is subtracted.
     rounding: float = 0.0
-    axial: bool = False  # whether force and displacement were measured, or moduli of tension, instead of torque
+    axial: bool = False  # whether the test is one of tension or compression, not of torsion
     # Relative change of all moduli per metre of the height or thickness, and per metre of the radius, if a TOML file
     # describes the test.
     per_size: tuple[float, float] = (0.0, 0.0)
@@ -92,7 +93,7 @@ class TimeTest(NamedTuple):
         return float(self.time[first])
 
     def base_line_errors(self, rows: np.ndarray) -> np.ndarray:
-        """Return the changes (k, m) of the responses in m rows by k independent errors of the subtracted base line.
+        """Return the changes (k, m) of m responses due to k independent errors of the subtracted base line.
 
         Each error is one standard error. k is 0 if no base line was subtracted.
         """
@@ -116,15 +117,16 @@ class TimeTest(NamedTuple):
 
     @property
     def since_change(self) -> np.ndarray:
-        """Times (n,) [s] since the load last began to change or changed its direction. A row at this instant belongs
-        to the load before."""
+        """Times (n,) [s] since the load last began to change or changed its direction. At the instant of a change, the
+        time since the earlier change is given."""
         begins = begins_of_changes(self.time, self.driven, self.begun)
         return self.time - begins[np.maximum(np.searchsorted(begins, self.time) - 1, 0)]
 
     @property
     def resolved(self) -> tuple[float, float]:
-        """Shortest and longest relaxation time [s] that the test resolves: the shortest time of a fitted response since
-        a change of the load (`since_change`), and the time from the start of the load to the last fitted response."""
+        """Shortest and longest relaxation time [s] that the test resolves: the shortest time between a change of the
+        load and a fitted response (`since_change`; responses at the instant of a step do not count), and the time from
+        the start of the load to the last fitted response."""
         time, since = self.time[self.used], self.since_change[self.used]
         return float(since[~_at_once(time, since)].min()), float(time[-1] - self.begun)
 
@@ -253,7 +255,7 @@ def from_rest(
     size, rows = np.abs(driven), _rows_of_jumps(time, driven)
     loaded = size[0] > AT_REST * np.max(size)
     still = loaded and bool(np.all(np.abs(driven[1:6] - driven[0]) <= _JUMP * np.max(size)))
-    early = ramp is not None and loaded and (ramp == 0 or (still and 0 < ramp <= time[0]))  # complete at the first row
+    early = ramp is not None and loaded and (ramp == 0 or (still and 0 < ramp <= time[0]))  # the rise is already over
     if ramp is not None and not ramp >= 0:
         raise InputError(f"{names[0]}: {names[1]} {ramp:g} is not a duration: give 0 or more seconds")
     if ramp is not None and not early and not (len(rows) and 0 <= ramp <= time[rows[0]] - time[rows[0] - 1]):
@@ -294,8 +296,8 @@ def with_known_rise(test: TimeTest, time: np.ndarray, driven: np.ndarray, ramp: 
     return test._replace(rise=BEFORE_ROWS) if before else test
 
 
-#: The load jumps between two rows if it changes by more than _JUMP times its largest value, and if its changes before
-#: and after are below _COMPLETE times this change. See `_rows_of_jumps` for irregular times.
+#: The load jumps between two rows if it changes by more than _JUMP times its largest value, and if the changes of the
+#: load before and after are below _COMPLETE times this change. See `_rows_of_jumps` for irregular times.
 _JUMP, _COMPLETE = 0.05, 0.5
 #: Duration of a step, as a fraction of the time between two rows. It is so short that it resolves no relaxation time.
 AT_ONCE = 1e-4
@@ -304,8 +306,8 @@ AT_ONCE = 1e-4
 def _rows_of_jumps(time: np.ndarray, driven: np.ndarray) -> np.ndarray:
     """Return the indices (j,) of the rows at the ends of jumps. No row shows how the load changed in a jump.
 
-    The changes before and after a jump are small within equal times, or both their sizes and their rates are small
-    between the neighbouring rows. So a straight ramp at irregular times has no jump.
+    The changes of the load before and after a jump must be small: either the changes within equal times, or both the
+    changes and their rates between the neighbouring rows. So a straight ramp at irregular times has no jump.
     """
     begin, end = time[:-1], time[1:]
     own, least = np.abs(np.diff(driven)), _JUMP * np.max(np.abs(driven))
@@ -318,8 +320,8 @@ def _rows_of_jumps(time: np.ndarray, driven: np.ndarray) -> np.ndarray:
 
 
 def _at_once(time: np.ndarray, since: np.ndarray) -> np.ndarray:
-    """Return whether each response (n,) is at the instant of a step. `time`: times (n,) [s] of the responses. `since`:
-    times (n,) [s] since the last change of the load."""
+    """Return for each response (n,) whether it is at the instant of a step. `time`: times (n,) [s] of the responses.
+    `since`: times (n,) [s] since the last change of the load."""
     first = np.diff(since, prepend=np.inf) <= 0  # the first response after a change
     # No response follows the last one, so the two intervals before it count. One of them may be a step.
     return first & (since < AT_ONCE * np.append(since[1:], np.ptp(time[-3:])))

@@ -20,8 +20,8 @@ import scipy.spatial
 
 from liverjax.solvers.blas import one_blas_thread
 
-#: PARTS: values of the correlated part a that are tried. LENGTHS: number of lengths that are tried, from a third of the
-#: distance between neighbours to the size of the body.
+#: PARTS: values of the correlated part a that are tried. LENGTHS: number of correlation lengths that are tried. They
+#: range from a third of the distance between neighbours to the size of the body.
 PARTS, LENGTHS = (0.3, 0.6, 0.9, 0.99), 8
 #: Orders of the Matérn function: for smoothed noise, and for drifting noise.
 ORDERS = ("3/2", "1/2")
@@ -37,8 +37,8 @@ LEAST = 0.2
 #: Residuals are clipped at this many robust standard deviations, so that a single wrong point does not look like
 #: correlated noise.
 OUTLIER = 5.0
-#: An unknown enters the likelihood if the norm of its derivatives in the chosen groups, divided by their norm in all
-#: groups, exceeds this value.
+#: The likelihood uses an unknown only if the residuals of the chosen groups depend on it: the norm of their
+#: derivatives, divided by the norm for all groups, must exceed this value.
 SHOWN = 1e-9
 #: If a singular value of the scaled derivatives, divided by the largest one, is below this value, the direction of this
 #: singular value is ignored.
@@ -55,7 +55,7 @@ class Alike(NamedTuple):
     level: float  # level s: standard deviation divided by the stated standard deviation
     root: np.ndarray  # (p, p) square root of the covariance of the unknowns
     gain: float  # gain of the log likelihood compared with independent noise
-    independent: float  # number of independent residuals with the same information
+    independent: float  # equivalent number of independent residuals
 
 
 def alike_noise(
@@ -88,7 +88,7 @@ def _alike_noise(
     if not 0 < neighbour < size or len(r) <= 2 * J.shape[1]:
         return None
     lengths = np.geomspace(neighbour / 3, size, LENGTHS)
-    # If the chosen groups do not depend on an unknown, this unknown absorbs no noise of their residuals.
+    # If the residuals of the chosen groups do not depend on an unknown, this unknown absorbs none of their noise.
     shown = np.linalg.norm(J[np.concatenate(chosen)], axis=0) > SHOWN * np.linalg.norm(J, axis=0)
     if not 0 < shown.sum() < sum(map(len, chosen)):
         return None
@@ -187,9 +187,9 @@ def _probability_at(data: list, far: list[np.ndarray], order: str, length: float
 
 
 def _of_unknowns(places: np.ndarray, shape: tuple[str, float, float], inverse: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the part J^+ C (J^+)^T (p, p) of the covariance of the p unknowns that comes from one group of n residuals
-    with the correlation matrix C. Also return the number of independent residuals of the group, n^2 / sum(C). Only a
-    few rows of C are computed at a time.
+    """Return the contribution J^+ C (J^+)^T (p, p) of one group of n residuals to the covariance of the p unknowns. C
+    is the correlation matrix of the group. Also return the number of independent residuals of the group, n^2 / sum(C).
+    Only a few rows of C are computed at a time.
 
     `shape`: order, correlation length and correlated part of the noise.
     """

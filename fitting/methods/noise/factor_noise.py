@@ -50,7 +50,7 @@ def factors_of_groups(
     slope: np.ndarray,
 ) -> list[FactorNoise]:
     """Return the noise of factors (`factors_of_series`) for each possible grouping of the curves. The curves of one
-    group have the same factor. Equal groupings are used once.
+    group have the same factor. If two groupings are equal, only the first is used.
 
     Args:
         groupings: name of the group of each curve, for each grouping.
@@ -70,19 +70,20 @@ def factors_of_series(
     counts: list[int], J: np.ndarray, r: np.ndarray, fitted: np.ndarray, slope: np.ndarray
 ) -> FactorNoise | None:
     """Fit noise with the covariance s^2 (I + q^2 f_k f_k^T) to the residuals of each series k. Here s is the standard
-    deviation of the independent noise, q s the standard deviation of the factors, and f_k are the fitted values.
-    Returns None for a single series or too few residuals.
+    deviation of the independent noise, q s the standard deviation of the factors, and f_k are the fitted values of the
+    series. Returns None for a single series or too few residuals.
 
     There are few factors, so their standard deviation is uncertain. If the residuals show factors, their standard
-    deviation is enlarged by Student's t with K - 1 degrees of freedom. If noise alone may explain the factors, their
-    standard deviation is not enlarged. If the unknowns can compensate most of the effect of the factors, the residuals
-    hardly show the factors. Then `hidden` and `moves` describe the largest factors that the residuals do not exclude.
+    deviation is enlarged according to Student's t with K - 1 degrees of freedom. If noise alone may explain the
+    factors, their standard deviation is not enlarged. If the unknowns can compensate most of the effect of the factors,
+    the residuals hardly show the factors. Then `hidden` and `moves` describe the largest factors that the residuals do
+    not exclude.
 
     Args:
         counts: number of rows of each of the K series.
         J: derivatives (n, p) of the residuals with respect to the unknowns u.
         r: residuals (n,).
-        fitted: fitted values f (n,), which a factor multiplies, divided by the scales of the residuals.
+        fitted: fitted values f (n,), divided by the scales of the residuals. A factor multiplies these values.
         slope: derivatives (P, p) of the P parameters with respect to u.
     """
     (n, p), K = J.shape, len(counts)

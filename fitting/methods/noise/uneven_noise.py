@@ -65,7 +65,8 @@ def probability_of_sizes(J: np.ndarray, r: np.ndarray, size: np.ndarray) -> tupl
 _CHANCE, _CONDITION = 1e-3, 1e-8
 #: Noise with one size in Pa is assumed only if its log-likelihood exceeds that of relative noise by this value.
 _LIKELIER = 5.0
-#: Residuals are smooth if the correlation of neighbours, times the root of their number, exceeds this value.
+#: Residuals are smooth if the correlation of neighbours, times the square root of the number of residuals, exceeds this
+#: value.
 _ALIKE = 2.0
 
 
@@ -77,12 +78,12 @@ def root_of_sizes(J: np.ndarray, sizes: np.ndarray, slope: np.ndarray) -> np.nda
 
 
 def weighted_by_sizes(J: np.ndarray, r: np.ndarray, sizes: np.ndarray, groups: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the residuals (n,) of a second fit, in which each residual is divided by its standard deviation
-    (first-order estimate).
+    """Return the residuals (n,) of a second fit, which is weighted by the inverse standard deviations (first-order
+    estimate).
 
-    In the first fit, the values with large noise move the model, so that all residuals of the values with small noise
-    may have the same sign. These residuals are also larger than their noise. So the sizes of the groups are estimated
-    again from the second fit, up to `_ROUNDS` times.
+    In the first fit, the values with large noise shift the model. So all residuals of the values with small noise may
+    have the same sign, and exceed their noise. Therefore the standard deviations of the groups are estimated again from
+    the second fit, up to `_ROUNDS` times.
 
     Args:
         J, r: see `uneven_root`. They belong to the first fit, with equal weights.
@@ -104,7 +105,7 @@ def weighted_by_sizes(J: np.ndarray, r: np.ndarray, sizes: np.ndarray, groups: S
 
 def sizes_shown(J: np.ndarray, r: np.ndarray, scales: np.ndarray) -> np.ndarray | None:
     """Return the standard deviations (2m,) of the residuals of m values of G' and of m values of G'', if the residuals
-    show that these differ. Returns None if they may be equal.
+    show that these standard deviations differ. Returns None if they may be equal.
 
     There are two alternatives to equal noise. G' and G'' may have relative noise of different size (`grouped_sizes`).
     Or the noise of all values may have one size in Pa, for example because of the resolution of the torque.
@@ -152,7 +153,7 @@ def grouped_sizes(J: np.ndarray, r: np.ndarray, group: np.ndarray) -> np.ndarray
 
 def _are_smooth(r: np.ndarray) -> bool:
     """Return whether neighbouring residuals of G', or of G'' (second half of r), are more alike than chance explains.
-    The neighbours are those in the order of the frequencies."""
+    Residuals are neighbours if their frequencies are consecutive."""
     first, second = r[: len(r) // 2], r[len(r) // 2 :]
     alike = (first[1:] @ first[:-1] + second[1:] @ second[:-1]) / max(float(r @ r), 1e-300)
     return bool(alike > _ALIKE / np.sqrt(len(r)))

@@ -20,8 +20,8 @@ CHAINS, FEWEST = 4, 500
 #: In each step, the power of the likelihood rises until the effective sample size is this fraction of the number of
 #: particles.
 EFFECTIVE = 0.5
-#: The moves of a step end if the correlation with the positions before the step is below FORGOTTEN, or in the last step
-#: below FORGOTTEN_LAST. MOST: maximum number of moves in a step.
+#: The moves of a step end if the correlation between the positions of the particles now and before the step is below
+#: FORGOTTEN, or in the last step below FORGOTTEN_LAST. MOST: maximum number of moves in a step.
 FORGOTTEN, FORGOTTEN_LAST, MOST = 0.6, 0.2, 30
 #: Fraction of the moves that use the whole difference of two particles. Such moves can lead from one maximum to
 #: another.
@@ -44,7 +44,7 @@ class Chains(NamedTuple):
     steps: int  # number of increases of the power, in all runs together
     moves: int  # number of moves of each particle, in all runs together
     acceptance: float  # accepted fraction of the last moves
-    remembered: float  # largest correlation of the draws with the positions before the last moves
+    remembered: float  # largest correlation of the particles with their positions before the last moves
 
 
 class _Particles(NamedTuple):

@@ -1,1 +1,1 @@
-"""Checks of measured rows: scatter of the load and of the phase, and courses in time that no material has."""
+"""Checks of measured rows: scatter of the load and of the phase, and responses in time that no material can have."""

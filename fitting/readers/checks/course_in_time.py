@@ -1,4 +1,4 @@
-"""Check that the course of a response in time is possible for a material under the load of its test."""
+"""Check that a measured response in time is possible for a material under the load of its test."""
 
 import numpy as np
 
@@ -7,8 +7,8 @@ from liverjax.core.errors import InputError
 
 
 def of_the_other_kind(kind: str, time: np.ndarray, strain: np.ndarray, stress: np.ndarray) -> list[str]:
-    """Return a note if the imposed quantity of this kind of test changes in the second half, while the other quantity
-    is constant.
+    """Return a note if the quantity that should be imposed in this kind of test changes in the second half, while the
+    other quantity is constant.
 
     No note is given if the rate of change is constant, because some samples are strained at a constant rate until their
     stress is steady.
@@ -41,7 +41,8 @@ _WRONG_WAY, BEYOND_NOISE = 0.25, 6.0
 
 
 def another_course(path: str, kind: str, time: np.ndarray, values: np.ndarray, given: tuple) -> list[str]:
-    """Check that a modulus does not rise, and a compliance does not fall, under a constant load. Return notes.
+    """Check that a modulus does not rise, and a compliance does not fall, under a constant load. Return notes. A rise
+    of the modulus is not checked if a ramp is given.
 
     A running median removes single wrong rows. `given`: duration of the ramp [s], first fitted time [s].
 

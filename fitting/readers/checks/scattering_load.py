@@ -56,8 +56,8 @@ def without_scatter(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[np
 
 def _of_the_hold(driven: np.ndarray) -> float:
     """Return the scatter of the load at the end of the hold, from the differences of neighbouring rows. Only rows above
-    half of the largest load are used, and of these the later half. The result is infinite if there are fewer than
-    two such rows."""
+    half of the largest load are used, and only the later half of these rows. The result is infinite if there are fewer
+    than two such rows."""
     steps = np.abs(np.diff(driven[np.abs(driven) > np.max(np.abs(driven)) / 2]))
     late = steps[len(steps) // 2 :]
     return float(np.quantile(late, 0.75)) / (1.1503 * np.sqrt(2)) if len(late) else np.inf
@@ -66,7 +66,7 @@ def _of_the_hold(driven: np.ndarray) -> float:
 def _from_neighbours(time: np.ndarray, driven: np.ndarray) -> float:
     """Return the scatter of the load, from the distances of the rows from the straight lines between their neighbours.
 
-    Irregular times of a straight ramp do not count as scatter here, as they do in `noise_of_series`. Most distances of
+    Here, irregular times of a straight ramp do not count as scatter. In `noise_of_series`, they do. Most distances of
     rounded loads are 0, so the upper quartile is used, which is 1.15 standard deviations of Gaussian noise.
     """
     if len(time) < 3:
@@ -87,7 +87,7 @@ _OF_HOLD = 500
 def _straight_ramp(
     time: np.ndarray, driven: np.ndarray, places: tuple[int, int, float], noise: float
 ) -> tuple[float, float, np.ndarray] | None:
-    """Return start and end [s] of a linear ramp, and the load (n,) before, during and after the ramp without scatter.
+    """Return start and end [s] of a linear ramp, and the load (n,) without scatter before, during and after the ramp.
     Returns None if the ramp is not linear.
 
     `places`: index of the first row under load, index of the first row of the hold, load at rest.
@@ -113,13 +113,13 @@ def _straight_ramp(
     start, spacing = time[[before, first]], (time[first] - time[before]) / (first - before)
 
     def misfit(later: np.ndarray) -> float:
-        """Return the misfit if begin and end of the ramp (`start`) are moved by `later` (2,), in units of `spacing`."""
+        """Return the misfit if the ends of the ramp (`start`) are moved by `later` (2,), in units of `spacing`."""
         begin, end = start + spacing * later
         return float(np.sum(((line_from(begin, end, low) - driven) / noise) ** 2))
 
     ends = np.linspace(time[rest], time[min(first + max(3, (first - rest) // 4), len(time) - 1)], 400)
     near = ends[int(np.argmin([np.sum((line_from(time[0], end, 0.0) - driven) ** 2) for end in ends]))]
-    # The tolerances of the search are absolute, so it must not depend on the units of time and load.
+    # The tolerances of the search are absolute, so the misfit is made independent of the units of time and load.
     simplex = {"initial_simplex": np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])}
     free = start + spacing * scipy.optimize.minimize(misfit, np.zeros(2), method="Nelder-Mead", options=simplex).x
     # First try: a ramp from load 0 at the first row. Second try: a ramp from the load at rest, at a fitted time.

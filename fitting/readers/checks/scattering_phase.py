@@ -10,16 +10,16 @@ from fitting.readers.frequency_sweep import (
     mostly_repeated,
 )
 
-#: Phase errors may be the cause of the scatter of G'' if its relative scatter exceeds both _SCATTERS and _MORE times
-#: the relative scatter of G'. With few points (n), the ratio of the two scatters can be larger by chance, so _MORE is
-#: multiplied by 1 + _BY_CHANCE / n. If G' and G'' have equal noise, 1 % of all sweeps exceed a ratio of 6 at 12 points,
-#: and of 3 at 40 points.
+#: Phase errors may be the cause of the scatter of G'' if the relative scatter of G'' exceeds both _SCATTERS and _MORE
+#: times the relative scatter of G'. With few points (n), the ratio of the two scatters can be larger by chance, so
+#: _MORE is multiplied by 1 + _BY_CHANCE / n. If G' and G'' have equal noise, 1 % of all sweeps exceed a ratio of 6 at
+#: 12 points, and of 3 at 40 points.
 _SCATTERS, _MORE, _BY_CHANCE = 0.03, 3.0, 9.0
 #: Minimum number of points, and of points per decade, for this test. With fewer points, the curvature of G' and of the
 #: sine of the loss angle over log frequency would look like scatter.
 _FEWEST, _PER_DECADE = 8, 5.0
 #: Noise proportional to G'' is assumed only if its log-likelihood exceeds that of noise proportional to |G*| by more
-#: than this value. The reason: it is rare that only G'' has noise proportional to its own size.
+#: than this value. The reason: noise proportional to G'' in G'' alone is rare.
 _BETTER = 8.0
 #: Number of neighbouring points per polynomial in the comparison of the two kinds of noise.
 _NEIGHBOURS = 5

@@ -63,7 +63,7 @@ def is_angular(column: Column) -> bool:
 
 
 def header_columns(cells: list[str]) -> list[Column]:
-    """Return the columns of a sweep: first those with a known unit, and angular frequencies before frequencies.
+    """Return the columns of a sweep. Known units come first, and angular frequencies come before frequencies.
 
     The first column of a quantity is used. Further columns of the same quantity are compared with the first. If the
     columns are enough for a sweep, columns that the sweep does not need are ignored.

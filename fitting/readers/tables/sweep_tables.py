@@ -316,8 +316,8 @@ def _has_all_numbers(line: str, needed: list[Column]) -> bool:
 
 def _row_after(lines: list[str], k: int, needed: list[Column]) -> str | None:
     """Return the next whole row of numbers below line k, which has no numbers. Return None if there is no such row
-    above the next table. The cells are separated by tabs. Words in two of the needed columns are headings of another
-    table."""
+    above the next table. The cells are separated by tabs. A line with words in two of the needed columns is the header
+    of another table."""
     for line in lines[k:]:
         if _has_all_numbers(line, needed):
             return line

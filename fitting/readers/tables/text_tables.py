@@ -16,7 +16,7 @@ from liverjax.core.errors import InputError
 
 #: Maximum length of a line: Python's CSV reader cannot read longer cells.
 LONGEST_LINE = 131072
-#: The minus sign of Unicode. It is read as a hyphen, which numbers begin with in most files.
+#: The minus sign of Unicode. It is replaced by a hyphen, the usual minus sign in files.
 MINUS = "\u2212"
 
 
@@ -93,8 +93,8 @@ def _decoded(path: Path, data: bytes) -> str:
 
 
 def without_later_sheets(lines: list[str], head: int) -> tuple[list[str], list[str]]:
-    """Return the lines above the next sheet (or step of an instrument) below line `head`, the header of a table. Also
-    return a note with the names of the sheets that are not read; empty sheets are not named."""
+    """Return all lines above the first sheet (or step of an instrument) that begins below the table header, line
+    `head`. Also return a note with the names of the sheets that are not read; empty sheets are not named."""
     starts = [k for k in range(head + 1, len(lines)) if lines[k].strip().lower() == "[step]"]
     parts = [lines[start + 1 : end] for start, end in itertools.pairwise([*starts, len(lines)])]
     names = [part[0].strip() for part in parts if any(map(str.strip, part[1:]))]
@@ -235,9 +235,10 @@ def is_summary(label: str) -> bool:
 def summary_rows(rows: list[list[str]]) -> dict[int, str]:
     """Return the indices of rows such as "Mean" and "SD" at the end of a table, and the label of each row.
 
-    The label is a cell before the first number. Only the label of a mean or deviation may also be a later cell, because
-    words such as "max" in later cells may be remarks on a measured row. If no row above has a label, all labelled rows
-    below a mean are summaries. If a label is repeated, no row is a summary: such labels may be names of samples.
+    The label is a cell before the first number. Only the label of a mean or deviation may also stand in a later cell,
+    because words such as "max" in later cells may be remarks on a measured row. If no row above has a label, all
+    labelled rows below a mean are summaries. If a label is repeated, no row is a summary: such labels may be names of
+    samples.
     """
     labels = [_label(row) for row in rows]
     end = len(rows)

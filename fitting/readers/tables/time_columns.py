@@ -298,7 +298,7 @@ _SHEAR = re.compile(r"shear|g\(t\)|j\(t\)|schub|scher|cisail", re.IGNORECASE)
 
 
 def _all_tensile(found: dict[str, tuple[int, str | None]], cells: list[str]) -> dict[str, tuple[int, str | None]]:
-    """Make all quantities tensile if one is tensile, except those whose headings name shear. Return the columns."""
+    """Make all quantities tensile if one is tensile, but not those whose headings name shear. Return the columns."""
     if not TENSILE.keys() & found.keys():
         return found
     return {
@@ -328,7 +328,7 @@ def _known_column(quantity: str, unit: str) -> bool:
 
 def _rows_in_time(path, lines, k, delimiter, found):
     """Return the numbers below the header, the units from a line of units, and notes. An empty cell is NaN. Below the
-    header, lines that begin with `#` are comments; only a line of units may begin so."""
+    header, lines that begin with `#` are comments. Only a line of units may also begin with `#`."""
     kept, numbers, every, units, notes = [], [], [], {}, []
     needed = {q: place for q, (place, _) in found.items()}
     headings = split_cells(lines[k - 1].lstrip("# "), delimiter)
@@ -369,7 +369,7 @@ def _rows_in_time(path, lines, k, delimiter, found):
 
 
 def _rows_follow(below: list[str], delimiter: str, places: list[int]) -> bool:
-    """Return whether numbers of the same table follow below."""
+    """Return whether the lines `below` contain more numbers of the same table."""
     for line in below:
         if _begins_a_table(line):
             return False

@@ -7,7 +7,7 @@ The layout is the TRIOSJSONExportSchema of TA Instruments. The table is in `Resu
 
 import json
 
-#: Key in a row. Its value is the id of the test step of this row.
+#: Key in each row for the id of its test step.
 STEP = "Results Step Id"
 
 
