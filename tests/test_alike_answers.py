@@ -14,7 +14,7 @@ from fitting.methods import time_response, uncertainty
 from fitting.methods.estimate import LEAST_FREEDOM
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers import time_tests as reader
-from fitting.readers.base_line import base_line
+from fitting.readers.base_line import _straight_line, base_line
 from fitting.readers.frequency_sweep import Sweep
 from fitting.readers.time_tests import TimeTest
 
@@ -292,6 +292,13 @@ def test_an_offset_needs_more_than_noise_of_similar_neighbours():
         lines = [base_line(time, 0.1 + 0.01 * _autoregression(rng, 20, part), 1.0, 1000.0) for _ in range(500)]
         z = [(line.level - 0.1) / line.level_error for line in lines if line.left == line.slope == 0]
         assert 0.8 < np.std(z) < (2.3 if part else 1.2)  # the old errors gave 3.5 and 1.1
+
+
+def test_errors_of_a_drift_contain_the_correlation_of_few_rows():
+    """The correlation of residuals is too small by (2 + 4 r) / n: 81 % of the slopes were within two errors."""
+    rng, time = np.random.default_rng(0), np.arange(20) / 20
+    lines = [_straight_line(time, _autoregression(rng, 20, 0.6)) for _ in range(2000)]
+    assert np.mean([abs(slope) < 2 * error for _, slope, _, error in lines]) > 0.84
 
 
 def test_the_error_of_equal_rows_at_rest_is_their_rounding(tmp_path):

@@ -182,3 +182,8 @@ def test_the_warning_about_correlated_noise_is_in_the_report():
     with pytest.warns(UserWarning, match="residuals of points") as told:
         found = scene_numbers._of_alike_noise(problem, lambda u: u, minimum, estimate)
     assert str(told[0].message) in field_report.of_numbers(found)["warnings"]
+    assert np.allclose(np.linalg.norm(found.root, axis=1), found.standard_errors)  # also with the larger errors
+    wide = estimate._replace(standard_errors=found.standard_errors * [2.0, 0.5])
+    with pytest.warns(UserWarning, match="residuals of points"):
+        found = scene_numbers._of_alike_noise(problem, lambda u: u, minimum, wide)
+    assert np.allclose(np.linalg.norm(found.root, axis=1), found.standard_errors)

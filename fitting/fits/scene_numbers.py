@@ -204,9 +204,9 @@ def _of_alike_noise(problem: Problem, natural_of: Callable, found: Solution, est
         "for independent noise"
     )
     warnings.warn(sentence, stacklevel=3)
-    errors = np.maximum(errors, estimate.standard_errors)
-    told = (*estimate.warnings, sentence)
-    return estimate._replace(root=root, standard_errors=errors, correlation=correlation, warnings=told)
+    larger = np.maximum(estimate.standard_errors / errors, 1.0)
+    told, root = (*estimate.warnings, sentence), larger[:, None] * root
+    return estimate._replace(root=root, standard_errors=larger * errors, correlation=correlation, warnings=told)
 
 
 #: The residuals show whether the noise differs between components only if there are at least this many measured

@@ -68,14 +68,21 @@ def base_line(time: np.ndarray, answer: np.ndarray, size: float, end: float, rou
 
 def _mean_at_rest(answer: np.ndarray) -> tuple[float, float]:
     """Return the mean of responses (n,) and its standard error. The error contains the correlation between neighbouring
-    responses. An estimate r of this correlation is too small by about (1 + 4 r) / n; this bias is corrected. The
-    correlation is limited to 1 - 2 / n, because n responses cannot determine a stronger one. With this limit, the error
-    is at most the scatter of the responses. If the correlation is strong and n is 20 or less, the error is still too
-    small."""
+    responses. With the limit of this correlation, the error is at most the scatter of the responses. If the correlation
+    is strong and n is 20 or less, the error is still too small."""
     n, mean = len(answer), float(np.mean(answer))
-    r = _neighbours_alike(answer - mean)
-    alike = min(max(r + (1 + 4 * r) / n, 0.0), _MOST_ALIKE, 1 - 2 / n)
+    alike = _correlation_of_noise(answer - mean, 1)
     return mean, float(np.std(answer, ddof=1) * np.sqrt((1 + alike) / (1 - alike) / n))
+
+
+def _correlation_of_noise(off: np.ndarray, numbers: int) -> float:
+    """Return the correlation of neighbouring noise, from residuals (n,) of a fit of 1 or 2 numbers (mean or line).
+
+    The correlation r of the residuals is too small by about (numbers + 4 r) / n; this bias is corrected. The result is
+    at most 1 - 2 numbers / n, because n residuals cannot determine a stronger correlation.
+    """
+    n, r = len(off), _neighbours_alike(off)
+    return max(min(r + (numbers + 4 * r) / n, _MOST_ALIKE, 1 - 2 * numbers / n), 0.0)
 
 
 def _neighbours_alike(off: np.ndarray) -> float:
@@ -90,7 +97,7 @@ def _straight_line(time: np.ndarray, answer: np.ndarray) -> tuple[float, float, 
     A = np.column_stack([np.ones(len(time)), time])
     found = np.linalg.lstsq(A, answer, rcond=None)[0]
     off = answer - A @ found
-    alike = min(max(_neighbours_alike(off), 0.0), _MOST_ALIKE)
+    alike = _correlation_of_noise(off, 2)
     variance = float(off @ off) / (len(time) - 2) * (1 + alike) / (1 - alike)
     errors = np.sqrt(variance * np.diag(np.linalg.pinv(A.T @ A)))  # rounded times may all be equal
     return float(found[0]), float(found[1]), float(errors[0]), float(errors[1])
