@@ -395,8 +395,9 @@ def _with_products_of_limits(J: np.ndarray, slope: np.ndarray, known: np.ndarray
     """Return the derivatives (n, k + q) of the misfit with respect to the unknowns of the k known parameters and to q
     directions (`_DETERMINED`). Also return the derivatives (k, k + q) of the known parameters.
 
-    For example, one parameter goes to infinity and another to 0, and their product is a modulus. This product is then a
-    direction. Without this direction, the errors of the other parameters would be valid only for a known modulus.
+    For example, one parameter goes to infinity and another to 0, and the data determine only their product, a modulus.
+    This product is then one of the q directions. Without it, the errors of the other parameters would be valid only for
+    a known modulus.
 
     Args:
         J: derivatives (n, p) of the misfit with respect to the p unknowns.

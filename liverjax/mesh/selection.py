@@ -96,7 +96,7 @@ def boundary_triangles(mesh: TetMesh, nodes: Indices | None = None) -> np.ndarra
 def face_codes(triples: np.ndarray, V: int) -> np.ndarray:
     """Return an integer for each sorted triple of vertex numbers below V. Different triples have different integers.
 
-    If V is at most two million, all integers are below 2^63.
+    For V up to two million vertices, each integer is below 2^63, so it fits in 64 bits.
     """
     return (triples[:, 0] * V + triples[:, 1]) * V + triples[:, 2]
 

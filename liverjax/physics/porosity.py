@@ -222,7 +222,7 @@ def volumetric_stress(porosity: Porosity, J: Number) -> Number:
     K0, K_lim, r_w = porosity.bulk, porosity.limit_bulk, porosity.fluid_fraction
     J0 = 1 - r_w + r_w * K0 / K_lim
     u = _fluid_ratio(porosity, J)
-    near_1 = jnp.log1p(jnp.maximum((J - 1) / r_w, jnp.maximum(K0 / K_lim, 0.5) - 1))  # constant below J0, as u is
+    near_1 = jnp.log1p(jnp.maximum((J - 1) / r_w, jnp.maximum(K0 / K_lim, 0.5) - 1))  # constant for J < J0
     logarithm = jnp.where(u > 0.5, near_1, jnp.log(u))
     return K0 * r_w * logarithm + K_lim * jnp.minimum(J - J0, 0.0)
 

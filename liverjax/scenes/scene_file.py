@@ -262,7 +262,7 @@ def _linear_mesh(table: dict, folder: Path) -> TetMesh:
 
 
 def _cylinder(table: dict, scale: float) -> TetMesh:
-    """Make the mesh of a cylinder. Optional keys refine it near rims and rings, or give polygons the circle's area."""
+    """Make the mesh of a cylinder. Optional keys: refine it near rims, or match the circle's area."""
     for key in ("radius", "height", "cell_size"):
         if key not in table:
             raise InputError(f"[mesh] shape = 'cylinder' needs {key}: give a length")

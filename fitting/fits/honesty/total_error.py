@@ -44,8 +44,9 @@ def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
     `edges.values`. The error of the gap is a part of the share `geometry`.
 
     The share `band` is the larger change of a parameter if one end of the band is left out. This change counts only if
-    it is larger than expected from noise (`edges.decided_by`). The square of the standard error, or of the change due
-    to noise if it is larger, is subtracted from the square of this change. If the result is very large
+    it is larger than expected from noise (`edges.decided_by`). The share is the square root of a difference: the square
+    of this change, minus the square of the standard error. If noise alone causes a change larger than the standard
+    error, the square of that change is subtracted instead. If the result is very large
     (`edges.RUNS_AWAY`), the share is the absolute value of the parameter or its standard error, whichever is larger.
     For the share `long_times`, the farther end of `long_times.equilibrium_interval` is converted to a standard
     deviation, and the standard error is subtracted (as squares). The share `short_times` is the part of G0 that relaxed

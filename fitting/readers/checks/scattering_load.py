@@ -7,8 +7,8 @@ from fitting.readers.noise_of_series import noise_of_series
 
 #: Scatter of the load below this fraction of the largest load is ignored.
 QUIET = 1e-3
-#: In files of _FEW_ROWS rows or fewer, the scatter of the hold replaces the scatter of all rows if the scatter of all
-#: rows is larger by the factor _RAMP.
+#: For files of at most _FEW_ROWS rows: the scatter of the hold is used if that of all rows is more than _RAMP times
+#: larger.
 _FEW_ROWS, _RAMP = 10, 3.0
 
 
