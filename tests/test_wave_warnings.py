@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 from test_waves import DENSITY, HERTZ, H, plane_waves
 
 from fitting.reports.waves import cautions, report
@@ -86,6 +87,80 @@ def test_a_springpot_that_misses_the_moduli_is_told(tmp_path):
     (tmp_path / "s.csv").write_text("\n".join(rows) + "\n")
     _, told = report._springpots({"whole": tmp_path / "s.csv"})
     assert any("misses the moduli over the frequencies by" in w for w in told)
+
+
+def _sweep_file(folder, hertz, G, sd):
+    """Write moduli G (n,) and their standard deviations sd (n,) [Pa] as a sweep, and return the file."""
+    rows = ["frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,storage_modulus_sd_Pa,loss_modulus_sd_Pa"]
+    columns = (hertz, G.real, G.imag, sd.real, sd.imag)
+    rows += [",".join(f"{v:.9g}" for v in row) for row in zip(*columns, strict=True)]
+    (folder / "s.csv").write_text("\n".join(rows) + "\n")
+    return folder / "s.csv"
+
+
+@pytest.mark.parametrize("number", [4, 8])
+def test_an_error_that_all_frequencies_share_is_in_the_springpot(tmp_path, number):
+    """An error of 10 % at every frequency became 0.1 % of the springpot at 8 frequencies."""
+    hertz = np.linspace(40, 110, number)
+    G = 1000 * (2j * np.pi * hertz) ** 0.2 * (1 + 0.002 * np.random.default_rng(0).normal(size=number))
+    file, row = _sweep_file(tmp_path, hertz, G, 0.1 * G), {}
+    for kind, part in (("error", 0.1), ("standard_error", 0.002), ("edge_error", 0.0), ("mesh_bias", -0.0999)):
+        row |= {f"{kind}_storage_Pa": part * G.real, f"{kind}_loss_Pa": part * G.imag}
+    found, _ = report._springpots({"whole": file}, {"frequencies_Hz": hertz, "whole": row, "regions": None})
+    errors = found["whole"]["standard_errors"]
+    assert found["whole"]["model"] == "springpot" and errors["springpot"] == pytest.approx(100, rel=0.02)
+    assert errors["exponent"] < 0.002  # a common factor does not change the exponent
+    found, _ = report._springpots({"whole": file})  # all of the error is noise
+    assert 0.1 / np.sqrt(2 * number) < found["whole"]["standard_errors"]["springpot"] / 1000 < 0.15
+
+
+@pytest.mark.parametrize(("part", "told"), [(0.01, True), (0.15, False)])
+def test_a_springpot_is_not_blamed_for_the_noise_of_the_moduli(tmp_path, part, told):
+    """A springpot that was within the errors was said to miss the moduli, which had larger errors than its own."""
+    hertz, noise = np.linspace(60, 130, 8), np.random.default_rng(1).normal(size=(2, 8))
+    G = 3000 + 2j * np.pi * hertz
+    G = G.real * (1 + 0.1 * noise[0]) + 1j * G.imag * (1 + 0.1 * noise[1])
+    found, said = report._springpots({"whole": _sweep_file(tmp_path, hertz, G, part * G)})
+    assert found["whole"]["mean_relative_error"] > report.MISSED
+    assert any("misses the moduli" in one for one in said) == told
+
+
+def test_a_label_without_a_modulus_is_named():
+    """The last of an even number of layers is in no element. Its label was missing in the results without a word."""
+    field, labels = plane_waves((7, 7, 8)), np.ones((7, 7, 8), int)
+    labels[..., 7] = 2
+    found = SimpleNamespace(labels=np.array([1]))
+    (said,) = cautions._of_lost_labels(field._replace(labels=labels), found)
+    assert said.startswith("regions 2: no voxel of these regions is in an element")
+    assert cautions._of_lost_labels(field._replace(labels=np.ones_like(labels)), found) == []
+    assert cautions._of_lost_labels(field, SimpleNamespace(labels=None)) == []
+
+
+@pytest.mark.parametrize("width", [0.7, 1.0])
+def test_a_frequency_of_smoothed_noise_is_named(width):
+    """Fourth differences of smoothed noise give a noise that is 2.5 to 7 times too small."""
+    rng, field = np.random.default_rng(2), plane_waves((7, 7, 9))
+    noise = rng.normal(size=field.displacement.shape[1:]) + 1j * rng.normal(size=field.displacement.shape[1:])
+    noise = 3e-6 * ndimage.gaussian_filter(noise, (width, width, width, 0))
+    for U, alone in ((noise, True), (field.displacement[1] + noise, False)):
+        own = field._replace(frequencies=HERTZ[1:], displacement=U[None])
+        own = own._replace(noise=wave_field.noise_of(own))
+        organ = elastography.organ_of(own, elastography.body_of(own), DENSITY)
+        found = elastography.regions_of(organ)
+        assert not cautions._of_no_motion(own, 0) and found.whole.correlations[0].seen
+        said = cautions.cautions_of_elastography(organ, found, None)
+        named = [one.startswith("100 Hz: the displacements") and "remove the data" in one for one in said]
+        assert any(named) == alone and cautions.frequencies_with_motion(own, found) == [0][alone:]
+
+
+def test_sweeps_are_without_frequencies_of_noise(tmp_path):
+    part = {key: [1.0, 2.0, 3.0, 4.0] for key in ("storage_Pa", "loss_Pa", "error_storage_Pa", "error_loss_Pa")}
+    content = {"frequencies_Hz": [40.0, 60.0, 80.0, 100.0], "whole": part, "regions": None}
+    organ = SimpleNamespace(field=SimpleNamespace(frequencies=np.array(content["frequencies_Hz"])))
+    for moves, rows in (([0, 2, 3], ["40", "80", "100"]), ([0, 2], ["40", "60", "80", "100"])):
+        file = report._sweeps(tmp_path, organ, content, moves)["whole"]
+        assert [row.split(",")[0] for row in file.read_text().splitlines()[1:]] == rows
+        assert any("without 60 Hz" in s for s in report._of_frequencies_left_out(organ, moves)) == (len(rows) == 3)
 
 
 @pytest.mark.parametrize("noise", [0.0, 4e-7])

@@ -43,6 +43,7 @@ class Correlation(NamedTuple):
     # (R,) error of each modulus, divided by its error for white noise. The sd of this white noise is the given sd if
     # `seen`, otherwise the sd of the noise itself.
     enlarged: np.ndarray
+    level: float = 0.0  # [m] sd of the noise, estimated from the residuals if `seen`; otherwise 0
 
 
 class _Projection(NamedTuple):
@@ -99,7 +100,8 @@ def correlation(
     means, parts = np.array([np.mean(r) for r, _ in rows]), np.array([part for _, part in rows])
     widths = np.interp(seen, means, WIDTHS[: len(rows)])
     level = np.sqrt(_mean_square(own, left)) / np.interp(np.mean(seen), means, parts)
-    return Correlation(beyond, True, level / sd * np.array([_enlargement(own, column, widths) for column in columns.T]))
+    enlarged = level / sd * np.array([_enlargement(own, column, widths) for column in columns.T])
+    return Correlation(beyond, True, enlarged, float(level))
 
 
 def _mean_square(own: _Projection, values: np.ndarray) -> float:

@@ -76,6 +76,6 @@ def _of_group(group: h5py.Group) -> Regions:
     numbers["components"] = int(numbers["components"])
     if "correlations" not in group:
         return Regions(**numbers)
-    beyond, seen, enlarged = (group[f"correlations/{field}"][:] for field in Correlation._fields)
-    every = zip(beyond, seen, enlarged, strict=True)
-    return Regions(**numbers, correlations=tuple(Correlation(float(b), bool(s), e) for b, s, e in every))
+    beyond, seen, enlarged, level = (group[f"correlations/{field}"][:] for field in Correlation._fields)
+    every = zip(beyond, seen, enlarged, level, strict=True)
+    return Regions(**numbers, correlations=tuple(Correlation(float(b), bool(s), e, float(v)) for b, s, e, v in every))

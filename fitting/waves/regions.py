@@ -22,6 +22,9 @@ WAVE_VOXELS, WAVE_BODIES, MODULI_APART, ROUGHLY, LOSS = 4.0, 6.0, 3.0, 0.3, 0.3
 #: ITERATIONS: maximum number of iterations. ENOUGH: the iterations end if the next change of each modulus, divided by
 #: the standard error of this modulus, is below this value.
 ITERATIONS, ENOUGH = 20, 0.1
+#: If the noise is larger than the given noise by more than this factor, the search for moduli and edges is repeated
+#: with the larger noise.
+NOISIER = 1.2
 
 
 class MeasuredWaves(NamedTuple):
@@ -43,6 +46,8 @@ class Regions(NamedTuple):
     iterations: np.ndarray  # (F,) number of Gauss-Newton iterations
     converged: np.ndarray  # (F,) bool: whether the iterations converged
     correlations: tuple[Correlation, ...] = ()  # correlation of the noise at each frequency, if it was computed
+    # (F, R) part of `standard_errors` that is due to the uncertain edges, not to the noise
+    edge_errors: np.ndarray = np.zeros((1, 1))
 
     @property
     def noise_factor(self) -> np.ndarray:
@@ -121,7 +126,8 @@ def moduli_of_regions(
 ) -> Regions:
     """Find the moduli by the Gauss-Newton method, separately for every frequency.
 
-    The positions of the edges between regions are also unknowns (`edge_places`).
+    The positions of the edges between regions are also unknowns (`edge_places`). If the noise turns out to be larger
+    than given, the search is repeated with the larger noise. Otherwise the edges would follow the noise.
 
     Args:
         m: matrices from `edges.region_matrices`.
@@ -135,20 +141,48 @@ def moduli_of_regions(
         voxel: voxel index of each node (V, 3), needed to estimate the correlation of the noise. If it is None, the
             noise is assumed to be white.
     """
-    found, before, correlations = [], None, []
+    found, before = [], None
     for f, own in enumerate(np.broadcast_to(start, (len(waves.omega), np.shape(start)[-1])).astype(complex)):
         *one, now = _one_frequency(m, waves, f, own if before is None else before, progress)
         if before is not None and not one[-1]:
             *again, then = _one_frequency(m, waves, f, own, progress)
             one, now = (again, then) if again[-1] else (one, now)
-        found.append(one)
+        fit = _with_errors(m, waves, f, (one, now), 1.0, voxel)
+        factor = float(np.mean(fit.noise_factor))
+        if len(m.patches.region) and factor > NOISIER:
+            *again, then = _one_frequency(m, waves._replace(sd=factor * waves.sd), f, one[0], progress)
+            if again[-1]:
+                one = [*again[:-2], one[-2] + again[-2], True]
+                fit = _with_errors(m, waves, f, (one, then), factor, voxel)
+        found.append(fit)
         before = one[0] if one[-1] else before
-        if voxel is not None:
-            C = m.rows(now.G, waves.omega[f])
-            given = m.by_moduli(now.here.motion), waves.motion[f], waves.sd[f], voxel
-            correlations.append(correlation(C, now.here, *given))
-    G, covariance, farther, chi2, iterations, converged = (np.array(each) for each in zip(*found, strict=True))
-    return Regions(G, covariance, farther, chi2, m.balances, iterations, converged, tuple(correlations))
+    names = [name for name in Regions._fields if name not in ("components", "correlations")]
+    joined = {name: np.concatenate([getattr(fit, name) for fit in found]) for name in names}
+    return Regions(components=m.balances, correlations=tuple(c for fit in found for c in fit.correlations), **joined)
+
+
+def _with_errors(m, waves, f, result, factor, voxel) -> Regions:
+    """Return the moduli at frequency number f with their errors. `result`: results of `_one_frequency` for noise that
+    is `factor` times the given noise, and the last state. `voxel`: see `moduli_of_regions`."""
+    (G, covariance, farther, chi2, iterations, converged), now = result
+    R = len(G)
+    correlations: tuple[Correlation, ...] = ()
+    if voxel is not None:
+        given = m.by_moduli(now.here.motion), waves.motion[f], waves.sd[f], voxel
+        correlations = (correlation(m.rows(G, waves.omega[f]), now.here, *given),)
+    own = {"modulus": G, "covariance": covariance, "farther": farther, "chi2": chi2 * factor**2}
+    own |= {"iterations": iterations, "converged": converged}
+    joined = {name: np.array([value]) for name, value in own.items()}
+    fit = Regions(components=m.balances, correlations=correlations, **joined)
+    by_noise = _covariance_of(now.hessian[: 2 * R, : 2 * R])  # the covariance if the edges were known
+    by_edges = np.where(np.isfinite(by_noise), covariance, 0.0) - np.where(np.isfinite(by_noise), by_noise, 0.0)
+    larger = np.tile(fit.noise_factor[0], 2)
+    if factor == 1.0:
+        by_edges = by_edges * np.outer(larger, larger)
+    else:  # `noise_factor` multiplies the covariance, but the uncertainty of the edges does not grow with the noise
+        fit = fit._replace(covariance=(by_noise / factor**2 + by_edges / np.outer(larger, larger))[None])
+    sd = np.sqrt(np.maximum(np.diagonal(by_edges), 0.0))
+    return fit._replace(edge_errors=(sd[:R] + 1j * sd[R:])[None])
 
 
 def _one_frequency(m, waves, f, G, progress):
@@ -202,9 +236,15 @@ def _gauss_newton(now: _State, labels: np.ndarray) -> tuple[np.ndarray, np.ndarr
     H = now.hessian + labels
     silent = np.diagonal(H) == 0  # the region has no element
     H[silent, silent] = 1.0
-    covariance = np.linalg.inv(H)
-    covariance[silent, silent] = np.inf
-    return -np.linalg.solve(H, now.gradient), covariance
+    return -np.linalg.solve(H, now.gradient), _covariance_of(now.hessian + labels)
+
+
+def _covariance_of(H: np.ndarray) -> np.ndarray:
+    """Return the inverse of a Hessian. The variance of an unknown without information is infinite."""
+    silent = np.diagonal(H) == 0
+    inverse = np.linalg.inv(H + np.diag(silent.astype(float)))
+    inverse[silent, silent] = np.inf
+    return inverse
 
 
 def _of_labels(m: RegionMatrices, R: int) -> np.ndarray:

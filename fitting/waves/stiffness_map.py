@@ -59,6 +59,8 @@ LEVEL = 0.5
 #: than this. FAR: a map has converged if the next step is shorter than this. The unit of NEAR and FAR is one standard
 #: deviation of the map.
 STEPS, NEAR, FAR = 40, 0.1, 0.2
+#: The search is repeated if the square roots of chi^2 per equation of two frequencies differ by more than this factor.
+UNEQUAL = 1.5
 #: The Hessian is computed again if a step is longer than this fraction of the step before. The search is then too far
 #: from the point at which the last Hessian was computed.
 _SLOW = 0.3
@@ -76,13 +78,24 @@ class WaveMap(NamedTuple):
     modulus: np.ndarray  # (F, P) complex [Pa]
     deviation: float  # chosen prior standard deviation of c
     length: float  # correlation length of the prior [m]
-    chi2: float
-    components: int  # number of real equations in chi2
+    chi2_of_frequencies: np.ndarray  # (F,) chi^2 of each frequency
+    components: int  # number of real equations in all chi^2 together
     noise_factor: np.ndarray  # (F,) errors of the map, divided by those for white noise with the given sd
     reached: bool  # whether chi2 is at most `components`
     distance: float  # distance to the minimum: length of the next step, in standard deviations of the map
     history: list[dict[str, float]]
     seconds: float
+
+    @property
+    def chi2(self) -> float:
+        """Sum of chi^2 over the frequencies."""
+        return float(np.sum(self.chi2_of_frequencies))
+
+    @property
+    def white_factor(self) -> np.ndarray:
+        """Square root (F,) of chi^2 per equation at each frequency, at least 1."""
+        number = len(self.chi2_of_frequencies)
+        return np.sqrt(np.maximum(1.0, self.chi2_of_frequencies * number / self.components))
 
 
 class Course(NamedTuple):
@@ -218,7 +231,29 @@ def map_of(
 
     Raises:
         InputError: `file` belongs to another fit or cannot be read.
+
+    The given noise may be too small at some frequencies. Then the search is repeated, with noise in the ratios that the
+    residuals show. `file` contains only the first search.
     """
+    found, w = _one_map(course, file, resume, draws, progress), course.waves
+    larger = found.white_factor / found.white_factor.min()
+    if not larger.max() > UNEQUAL:
+        return found
+    again = _one_map(course._replace(waves=w._replace(sd=larger * w.sd)), None, False, draws, progress)
+    chi2 = again.chi2_of_frequencies * larger**2
+    return again._replace(
+        chi2_of_frequencies=chi2,
+        noise_factor=again.noise_factor * larger,
+        reached=bool(chi2.sum() <= again.components),
+        history=[*found.history, *again.history],
+        seconds=found.seconds + again.seconds,
+    )
+
+
+def _one_map(
+    course: Course, file: Path | None, resume: bool, draws: int, progress: Callable[[int, float], None]
+) -> WaveMap:
+    """Return the map for the given noise. The arguments are those of `map_of`."""
     begin = time.perf_counter()
     begun = _first_or_resumed(course, file if resume else None)
     history, components = begun.history, course.m.balances * len(course.waves.omega)
@@ -229,7 +264,7 @@ def map_of(
     point, information = visited[int(np.argmax(evidence))]
     y = course.natural(course.scales(point.k) * point.z)
     exponent = course.by_frequency(y)
-    factors = _noise_factors(course, point, y, excess)
+    factors = _noise_factors(course, point, y)
     before, after, departures = _spread(course, point, _with_factors(course, point, information, factors), draws)
     slopes = np.stack([D @ y[: course.corners] for D in course.slopes])
     place = np.random.default_rng(1).uniform(-0.5, 0.5, (draws, 3)) @ slopes
@@ -243,7 +278,7 @@ def map_of(
         modulus=course.whole[:, None] * np.exp(exponent),
         deviation=DEVIATIONS[point.k],
         length=course.length,
-        chi2=point.chi2,
+        chi2_of_frequencies=np.array([here.chi2 for here in point.here]),
         components=components,
         noise_factor=factors,
         reached=point.chi2 <= components,
@@ -341,19 +376,19 @@ def _next_start(course: Course, point: _Reached) -> _Reached:
     return _reached(course, point.z * course.scales(point.k) / course.scales(point.k + 1), point.k + 1)
 
 
-def _noise_factors(course: Course, point: _Reached, y: np.ndarray, excess: float) -> np.ndarray:
+def _noise_factors(course: Course, point: _Reached, y: np.ndarray) -> np.ndarray:
     """Return noise factors (F,): the errors of the map, divided by the errors for white noise with the given sd.
 
     It is assumed that correlated noise enlarges the errors of a map by the same factor as the error of one modulus of
     the whole organ. The correlation is computed from the residuals of the map. The residuals of a fit with a uniform
-    modulus would also contain effects of real changes of the modulus. `excess`: chi^2 divided by its expected value, at
-    least 1.
+    modulus would also contain effects of real changes of the modulus.
     """
-    root, w = np.sqrt(excess), course.waves
+    w, white = course.waves, np.sqrt([max(1.0, here.chi2 / course.m.balances) for here in point.here])
     if course.voxel is None:
-        return np.full(len(w.omega), root)
+        return white
     found = []
-    for G, omega, d, sd, here in zip(course.moduli(y), w.omega, w.motion, w.sd, point.here, strict=True):
+    each = zip(course.moduli(y), w.omega, w.motion, w.sd, point.here, white, strict=True)
+    for G, omega, d, sd, here, root in each:
         column = np.asarray(balance.by_modulus(course.m, here.motion) @ G)[:, None]
         own = correlation(balance.rows_of_balance(course.m, G, omega), here, column, d, sd, course.voxel)
         found.append(max(own.enlarged[0], root if own.seen else root * own.enlarged[0]))

@@ -22,8 +22,7 @@ TOO_NEAR, FEW = 0.4, 50
 #: The chi^2 of a map is reported if it exceeds 1 per equation by more than ROUGH plus BY_CHANCE standard deviations.
 #: ROUGH allows for the error of the estimated noise.
 BY_CHANCE, ROUGH = 5.0, 0.03
-#: Correlated residuals of a map are reported if `noise_factor` exceeds this value times the square root of chi^2 per
-#: equation. Values of chi^2 per equation below 1 count as 1.
+#: Correlated residuals of a map are reported if `noise_factor` exceeds this value times `white_factor`.
 CORRELATED = 1.1
 #: Above this chi^2 per equation, the moduli may be wrong by more than their errors.
 WRONG = 10.0
@@ -33,8 +32,7 @@ def cautions_of_elastography(organ: Organ, found: Found, drawn: WaveMap | None) 
     """Return all warnings about a fit to waves. The arguments are the same as for
     `fitting.reports.waves.report.write`."""
     told, each = _sign(organ, found), found.whole if found.parts is None else found.parts
-    noise = organ.field.noise
-    moves = [f for f in range(len(noise)) if np.isfinite(noise[f]) and not _of_no_motion(organ.field, f)]
+    moves = frequencies_with_motion(organ.field, found)
     told += _of_scales(organ, found, moves)
     any_coarse = False
     order = components.order_sentence(organ.field)
@@ -43,7 +41,7 @@ def cautions_of_elastography(organ: Organ, found: Found, drawn: WaveMap | None) 
     for f, hertz in enumerate(organ.field.frequencies):
         if not np.isfinite(organ.field.noise[f]):
             continue
-        still = _of_no_motion(organ.field, f)
+        still = _of_no_motion(organ.field, f, found)
         if still:
             told += still
             continue
@@ -51,13 +49,13 @@ def cautions_of_elastography(organ: Organ, found: Found, drawn: WaveMap | None) 
         told += coarse + _of_residuals(hertz, each, f, "regions" if found.parts else "moduli", bool(coarse))
         any_coarse |= bool(coarse)
         told += _of_stopped_search(hertz, found, f) + (_of_long_waves(hertz, found, f) if each.converged[f] else [])
-    told += _of_sizes_and_edges(organ.field, found, moves)
+    told += _of_lost_labels(organ.field, found) + _of_sizes_and_edges(organ.field, found, moves)
     if drawn is not None and not drawn.distance <= FAR:
         told.append(
             f"the search for the map stopped {drawn.distance:.2g} standard deviations from the minimum: compare the "
             "map with regions"
         )
-    if drawn is not None and drawn.noise_factor.max() > CORRELATED * np.sqrt(max(1.0, drawn.chi2 / drawn.components)):
+    if drawn is not None and np.any(drawn.noise_factor > CORRELATED * drawn.white_factor):
         told.append(
             "map: the residuals at neighbouring voxels are correlated, so the standard deviations of the map are "
             f"enlarged {drawn.noise_factor.max():.3g} times"
@@ -69,11 +67,24 @@ def cautions_of_elastography(organ: Organ, found: Found, drawn: WaveMap | None) 
         told.append(
             f"chi2 of the map is {drawn.chi2 / drawn.components:.3g} per equation, so the standard deviations of "
             f"the map are too small. Possible causes: {'coarse voxels (mesh_bias), ' if any_coarse else ''}edges that "
-            "are sharper than in the map, noise that is larger in a part of the organ, a ratio of the moduli at "
-            "several frequencies that is not the same everywhere, or a body that does not move like a viscous solid. "
-            "Compare the map with the moduli of regions, and with the map from one frequency alone"
+            "are sharper than in the map, noise that is larger at a frequency or in a part of the organ, a ratio of "
+            "the moduli at several frequencies that is not the same everywhere, or a body that does not move like a "
+            "viscous solid. Compare the map with the moduli of regions, and with the map from one frequency alone"
         )
     return told
+
+
+def _of_lost_labels(field: WaveField, found: Found) -> list[str]:
+    """Return a warning about labels that no voxel of the elements has."""
+    if field.labels is None or found.labels is None:
+        return []
+    lost = np.setdiff1d(field.labels[field.mask], found.labels)
+    if not lost.size:
+        return []
+    return [
+        f"regions {', '.join(map(str, lost))}: no voxel of these regions is in an element, so they have no modulus. An "
+        "element needs 3 voxels along each axis: measure more voxels around these regions"
+    ]
 
 
 def _of_sizes_and_edges(field: WaveField, found: Found, moves: list[int]) -> list[str]:
@@ -142,17 +153,33 @@ def _of_small_regions(field: WaveField, labels: np.ndarray) -> list[str]:
 #: Below this ratio of the measured motion (root mean square) to the noise, the data contain hardly more than noise. The
 #: squares of motion and noise add up, so the true motion is then below two thirds of the noise.
 NO_MOTION = 1.2
+#: The same limit for noise that is estimated from correlated residuals. The fit follows a part of such noise, so this
+#: estimate is often 20 to 30 % too small for noise alone.
+NO_MOTION_IN_RESIDUALS = 1.5
 
 
-def _of_no_motion(field: WaveField, f: int) -> list[str]:
-    """Return a warning if the displacements at this frequency are hardly larger than their noise."""
+def frequencies_with_motion(field: WaveField, found: Found) -> list[int]:
+    """Return the indices of the frequencies whose displacements are larger than their noise."""
+    noise = field.noise
+    return [f for f in range(len(noise)) if np.isfinite(noise[f]) and not _of_no_motion(field, f, found)]
+
+
+def _of_no_motion(field: WaveField, f: int, found: Found | None = None) -> list[str]:
+    """Return a warning if the displacements at this frequency are hardly larger than their noise.
+
+    The noise of smoothed data is larger than the estimate from fourth differences. So if the residuals of the fits
+    `found` are correlated, the displacements are also compared with the noise that follows from these residuals.
+    """
     u = field.displacement[f][field.mask]
-    size = float(np.sqrt(np.nanmean(np.abs(u) ** 2) / 2))
-    if not size < NO_MOTION * field.noise[f]:
+    size, noise, most = float(np.sqrt(np.nanmean(np.abs(u) ** 2) / 2)), float(field.noise[f]), NO_MOTION
+    each = None if found is None else found.whole if found.parts is None else found.parts
+    if each is not None and f < len(each.correlations) and each.correlations[f].seen and not size < most * noise:
+        noise, most = each.correlations[f].level, NO_MOTION_IN_RESIDUALS
+    if not size < most * noise:
         return []
     return [
         f"{field.frequencies[f]:g} Hz: the displacements ({size:.2g} m) are hardly larger than their noise "
-        f"({field.noise[f]:.2g} m), so the waves are unknown; remove the data of this frequency"
+        f"({noise:.2g} m), so the waves are unknown; remove the data of this frequency"
     ]
 
 
@@ -314,7 +341,7 @@ def _sign(organ: Organ, found: Found) -> list[str]:
         zip(organ.field.frequencies, each.modulus, each.standard_errors, strict=True)
     ):
         known = np.abs(G.imag) > 3 * error.imag
-        if known.any() and not _of_no_motion(organ.field, f) and np.all(G.imag[known] < 0):
+        if known.any() and not _of_no_motion(organ.field, f, found) and np.all(G.imag[known] < 0):
             wrong.append(f"{hertz:g} Hz")
     if not wrong:
         return []

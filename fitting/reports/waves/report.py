@@ -2,11 +2,12 @@
 
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fitting.reports.sweep_report import numbers
-from fitting.reports.waves.cautions import cautions_of_elastography, chi2_text
+from fitting.reports.waves.cautions import cautions_of_elastography, chi2_text, frequencies_with_motion
 from fitting.reports.waves.maps import maps_picture, write_at_voxels, write_for_paraview
 from fitting.waves.elastography import Found, Organ
 from fitting.waves.regions import Regions
@@ -18,6 +19,10 @@ from liverjax.core.plotting import save
 from liverjax.core.struct import Content
 from liverjax.core.versions import versions
 
+if TYPE_CHECKING:
+    from fitting.fits.viscoelastic import Fit
+    from fitting.readers.rheometer import Sweep
+
 #: Minimum number of frequencies for which sweeps are written.
 FEWEST = 3
 #: A node of the map counts as different from the uniform organ if the logarithms of the two moduli differ by more than
@@ -25,6 +30,8 @@ FEWEST = 3
 TOLD = 3.0
 #: A warning is given if the relative error of the springpot model, averaged over the frequencies, exceeds this value.
 MISSED = 0.03
+#: This warning also requires that chi^2 per degree of freedom exceeds this value.
+EXPLAINED = 1.5
 
 
 def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: np.ndarray) -> Content:
@@ -53,8 +60,9 @@ def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: n
         "versions": versions(),
     }
     content = numbers(content)
-    content["springpots"], told = _springpots(_sweeps(out, organ, content))
-    content["warnings"] += told
+    moves = frequencies_with_motion(organ.field, found)
+    content["springpots"], told = _springpots(_sweeps(out, organ, content, moves), content)
+    content["warnings"] += _of_frequencies_left_out(organ, moves) + told
     write_whole(out / "waves.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
     write_at_voxels(out / "waves.h5", organ, drawn, usual)
     if drawn is not None:
@@ -67,12 +75,13 @@ def _of_regions(organ: Organ, own: Regions, bias: np.ndarray, left: np.ndarray) 
     """Return one dictionary for each of R regions, with lists over the F frequencies.
 
     The entries `error_...` contain the noise, the uncertain position of the edges, and the discretisation error of the
-    elements. The entries `standard_error_...` do not contain the discretisation error. The relative discretisation
+    elements. The entries `standard_error_...` do not contain the discretisation error. The entries `edge_error_...` are
+    the part due to the edges alone. The relative discretisation
     error was computed for plane waves in D directions with two polarisations, so for 2 D waves. It has two parts: its
     mean `bias` (F, R) over these waves, and the contribution `left` (F, R, 2 D) of each wave to the uncertainty of this
     mean.
     """
-    omega, rows = organ.waves.omega, []
+    omega, rows, edges = organ.waves.omega, [], np.broadcast_to(own.edge_errors, own.modulus.shape)
     for r in range(own.modulus.shape[1]):
         G, e = own.modulus[:, r], own.standard_errors[:, r]
         c, alpha = velocity_and_attenuation(G.real, G.imag, omega, organ.density)
@@ -85,6 +94,8 @@ def _of_regions(organ: Organ, own: Regions, bias: np.ndarray, left: np.ndarray) 
                 "error_loss_Pa": np.sqrt(e.imag**2 + missed.imag**2 + np.sum(along.imag**2, axis=1)).tolist(),
                 "standard_error_storage_Pa": e.real.tolist(),
                 "standard_error_loss_Pa": e.imag.tolist(),
+                "edge_error_storage_Pa": edges[:, r].real.tolist(),
+                "edge_error_loss_Pa": edges[:, r].imag.tolist(),
                 "edges_farther_out_voxels": own.farther[:, r].tolist(),
                 "mesh_bias_storage_Pa": missed.real.tolist(),
                 "mesh_bias_loss_Pa": missed.imag.tolist(),
@@ -100,12 +111,16 @@ def _of_regions(organ: Organ, own: Regions, bias: np.ndarray, left: np.ndarray) 
     return rows
 
 
-def _springpots(sweeps: dict[str, Path]) -> tuple[Content | None, list[str]]:
+def _springpots(sweeps: dict[str, Path], content: Content | None = None) -> tuple[Content | None, list[str]]:
     """Fit the moduli of each sweep with the springpot model that `models.best_of_models` chooses. Return the results
     (None if there are no sweeps) and warnings.
+
+    `content`: content of waves.json, from which `_noise_and_shared` takes the parts of the errors. If it is None, all
+    standard deviations in the files are noise.
     """
     if not sweeps:
         return None, []
+    from fitting.fits import viscoelastic
     from fitting.fits.families import models
     from fitting.readers import rheometer
 
@@ -118,38 +133,94 @@ def _springpots(sweeps: dict[str, Path]) -> tuple[Content | None, list[str]]:
             told.append(f"{name}: no springpot is fitted over the frequencies: {why}")
             continue
         told += [f"{name}: the springpot is fitted without some frequencies: {note}" for note in sweep.notes]
-        fit, _ = models.best_of_models(models.fractional(sweep), sweep)
-        u, off = fit.parameters, float(np.mean(fit.relative_errors(sweep)))
+        own, shared = _noise_and_shared(sweep, name, content)
+        fit, _ = models.best_of_models(models.fractional(own), own)
+        # The standard deviations are noise, even if the points scatter less than they state.
+        size = 2 * len(sweep.angular_frequency), True
+        u = viscoelastic.estimates(fit.solution, fit.kind, size, None)[1]
+        off = float(np.mean(fit.relative_errors(sweep)))
         assert u is not None
-        if off > MISSED:
+        if off > MISSED and _beyond_errors(fit, sweep):
             told.append(
                 f"{name}: the {fit.kind.name} misses the moduli over the frequencies by {100 * off:.2g} % on average; "
                 "use the moduli of each frequency"
             )
+        errors = np.hypot(u.standard_errors, np.linalg.norm(_moved_numbers(fit, own, shared), axis=0))
         found[name] = {
             "model": fit.kind.name,
             "numbers": {k: float(v) for k, v in zip(u.names, u.values, strict=True)},
-            "standard_errors": numbers({k: float(v) for k, v in zip(u.names, u.standard_errors, strict=True)}),
+            "standard_errors": numbers({k: float(v) for k, v in zip(u.names, errors, strict=True)}),
             "mean_relative_error": off,
             "frequencies": len(sweep.angular_frequency),
         }
     return found, told
 
 
-def _sweeps(out: Path, organ: Organ, content: Content) -> dict[str, Path]:
+def _noise_and_shared(sweep: "Sweep", name: str, content: Content | None) -> tuple["Sweep", np.ndarray]:
+    """Return the sweep with the noise alone as standard deviations, and changes (3, 2 n) [Pa] of G' and G'' at n
+    frequencies due to errors that are similar at all frequencies.
+
+    These changes are the mesh bias, and two more for G' and for G'': the uncertainty of the mesh bias together with
+    the uncertainty of the edges. More frequencies do not make these errors smaller. Without `content`, the sweep is
+    unchanged, and there are no such changes.
+    """
+    n = len(sweep.angular_frequency)
+    if content is None:
+        return sweep, np.zeros((0, 2 * n))
+    row = content["whole"] if name == "whole" else content["regions"][name]
+    hertz = np.array(content["frequencies_Hz"])
+    at = [int(np.argmin(np.abs(hertz - f))) for f in sweep.angular_frequency / (2 * np.pi)]
+    every, own, edges, bias = (
+        [np.array(row[f"{kind}_{part}_Pa"], float)[at] for part in ("storage", "loss")]
+        for kind in ("error", "standard_error", "edge_error", "mesh_bias")
+    )
+    noise = [np.sqrt(np.maximum(s**2 - e**2, 1e-12 * s**2)) for s, e in zip(own, edges, strict=True)]
+    rest = [np.sqrt(np.maximum(e**2 - s**2 - b**2, 0.0)) for e, s, b in zip(every, noise, bias, strict=True)]
+    blank = np.zeros(n)
+    changes = np.array([np.concatenate(bias), np.concatenate([rest[0], blank]), np.concatenate([blank, rest[1]])])
+    return sweep._replace(storage_sd=noise[0], loss_sd=noise[1]), changes
+
+
+def _moved_numbers(fit: "Fit", sweep: "Sweep", moved: np.ndarray) -> np.ndarray:
+    """Return the changes (k, P) of the P parameters of a springpot fit if the moduli change by `moved` (k, 2 n) [Pa],
+    to first order."""
+    from fitting.methods.estimate import with_slope
+
+    assert fit.kind.values is not None
+    right = (moved / np.concatenate(sweep.deviations)).T
+    steps = np.linalg.lstsq(np.asarray(fit.solution.jacobian), right, rcond=None)[0]
+    return (with_slope(fit.kind.values, fit.solution.u)[1] @ steps).T
+
+
+def _beyond_errors(fit: "Fit", sweep: "Sweep") -> bool:
+    """Return whether a fit misses the moduli by more than their standard deviations explain."""
+    if sweep.storage_sd is None or sweep.loss_sd is None:
+        return True
+    off = np.concatenate([(fit.storage - sweep.storage) / sweep.storage_sd, (fit.loss - sweep.loss) / sweep.loss_sd])
+    return float(off @ off) > EXPLAINED * max(1, len(off) - len(fit.solution.u))
+
+
+def _of_frequencies_left_out(organ: Organ, moves: list[int]) -> list[str]:
+    every = organ.field.frequencies
+    if not FEWEST <= len(moves) < len(every):
+        return []
+    still = ", ".join(f"{hertz:g}" for hertz in np.delete(every, moves))
+    return [f"the sweeps and the springpots are without {still} Hz, because the displacements there are only noise"]
+
+
+def _sweeps(out: Path, organ: Organ, content: Content, moves: list[int] | None = None) -> dict[str, Path]:
     """Write files with a frequency sweep of the whole organ and of each region, for ``python -m fitting``. Return these
-    files. With fewer than `FEWEST` frequencies, no file is written."""
+    files. With fewer than `FEWEST` frequencies, no file is written.
+
+    `moves`: indices of the frequencies with motion. Other frequencies are left out, unless fewer than `FEWEST` remain.
+    """
+    kept = moves if moves is not None and len(moves) >= FEWEST else range(len(organ.field.frequencies))
     if len(organ.field.frequencies) < FEWEST:
         return {}
     files = {}
     for name, own in {"whole": content["whole"], **(content["regions"] or {})}.items():
-        columns = [
-            content["frequencies_Hz"],
-            own["storage_Pa"],
-            own["loss_Pa"],
-            own["error_storage_Pa"],
-            own["error_loss_Pa"],
-        ]
+        names = ("storage_Pa", "loss_Pa", "error_storage_Pa", "error_loss_Pa")
+        columns = [[values[f] for f in kept] for values in (content["frequencies_Hz"], *(own[key] for key in names))]
         if any(v is None for column in columns for v in column):  # the data do not determine this region
             continue
         rows = ["frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,storage_modulus_sd_Pa,loss_modulus_sd_Pa"]
