@@ -268,8 +268,8 @@ def sentences() -> str:
     even, graded = (next(r for r in data["rows"] if _is_cook(r, form)) for form in (MIXED, f"{MIXED}, graded"))
     said.append(
         f"Cook's membrane was computed at K/mu = 1e4 with {even['elements']:,} quadratic mixed elements. With equal "
-        f"cells the error is {percent(abs(even['error']))} (run time {short(even['run_s'])} s). With as many cells "
-        f"that are small near the corner of the clamp, the error is {percent(abs(graded['error']))} "
+        f"cells the error is {percent(abs(even['error']))} (run time {short(even['run_s'])} s). With the same "
+        f"number of cells, but smaller ones near the corner of the clamp, the error is {percent(abs(graded['error']))} "
         f"({short(graded['run_s'])} s). With the estimate added, the errors are {percent(abs(even['corrected']))} "
         f"({short(even['corrected_s'])} s) and {percent(abs(graded['corrected']))} ({short(graded['corrected_s'])} s). "
         "So use the corrected result, and small cells at the edge of a clamp."

@@ -19,10 +19,11 @@ def job() -> str:
     times = ", ".join(f"{t:.2g}" for t in found["relaxation_times"])
     return (
         f"The sample is a lion's mane mushroom. The fit uses {used} of 31 measured frequencies; the last one shows an "
-        f"effect of the instrument.\nG0 is {kilo:.3g} kPa. Its error is {sd:.2g} kPa due to noise and {whole:.2g} kPa "
-        f"in total, mostly because of the ends of the band of frequencies.\nThe relaxation times are {times} s. The "
-        f"fitted moduli differ from the measured ones by {percent(found['mean_relative_error'])} on average. No "
-        f"linear\nmaterial can differ by less than {percent(found['details']['consistency']['kramers_kronig_misfit'])} "
+        f"effect of the instrument.\nG0 is {kilo:.3g} kPa. Its standard error due to noise is {sd:.2g} kPa. Its total "
+        f"error is {whole:.2g} kPa, mostly because of the ends of the band of frequencies.\nThe relaxation times are "
+        f"{times} s. The fitted moduli differ from the measured ones by {percent(found['mean_relative_error'])} on "
+        f"average. No linear\nmaterial can differ by less than "
+        f"{percent(found['details']['consistency']['kramers_kronig_misfit'])} "
         f"(root mean square of |G\\*|). The command takes {found['total_s']:.0f} s on two cores, and "
         f"{found['compile_time_s']:.0f} s of them\nare compilation. A second call takes {found['second_call_s']:.0f} s."
     )
@@ -105,7 +106,7 @@ def choices() -> str:
         f"its linear tetrahedra is much larger: in {mesh['ended']} static runs, the displacement differs from that of "
         f"quadratic elements by {percent(mesh['median'])} (median) to {percent(mesh['largest'])}.",
         "",
-        f"The assembly of force and stiffness needs no choice. Its error is {error_text(error)}. For "
+        f"The assembly of force and stiffness has no options. Its error is {error_text(error)}. For "
         f"{fig4['elements']:,} neo-Hookean tetrahedra it",
         f"takes {1e3 * r['seconds']['contracted']:.2g} ms. The chapter's six stiffness terms take "
         f"{slower['chapter']:.2g} times as long, standard finite elements with",
