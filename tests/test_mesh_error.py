@@ -2,6 +2,7 @@
 
 import re
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -128,12 +129,44 @@ def test_a_quadratic_body_that_has_come_to_rest_has_the_estimate_of_one_at_rest(
     assert np.abs(change - its).max() < 0.05 * np.abs(its).max()
 
 
+def _pushed(mu: jax.Array) -> lj.Scene:
+    """Return a box with a dead load. Its bulk modulus is 5 mu."""
+    mesh = lj.shapes.box((0.04, 0.04, 0.04), (1, 1, 1))
+    top = jnp.asarray(lj.boundary.boundary_triangles(mesh, mesh.node_sets["z_max"]))
+    return lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=mu, bulk=5 * mu),
+        fixed=(lj.Fixed(nodes=mesh.node_sets["z_min"]),),
+        traction=(lj.Traction(triangles=top, value=jnp.array([0.0, 3.0, 0.0])),),
+    )
+
+
+@pytest.mark.ci
+def test_the_derivative_of_the_estimate_contains_the_change_of_the_stiffness():
+    """At the reference positions the estimate is proportional to 1 / moduli. The derivative of a run's estimate was a
+    fifth of the true one, because the stiffness was a constant. The space also changed in a differentiated function.
+    """
+    spaces = [mesh_error.richer(_pushed(jnp.asarray(1000.0))).scene.solve.volumetric]
+
+    def estimate(mu: jax.Array) -> jax.Array:
+        scene = _pushed(mu)
+        x, rich = scene.mesh.points[None], mesh_error.richer(scene)
+        spaces.append(rich.scene.solve.volumetric)
+        return mesh_error.estimated_error(scene, rich, x, jnp.zeros_like(x)).positions[0]
+
+    change, slope = jax.jvp(estimate, (1000.0,), (1000.0,))
+    assert spaces == ["element", "element"] and jnp.max(jnp.abs(change)) > 1e-4
+    assert jnp.max(jnp.abs(slope + change)) < 0.02 * jnp.max(jnp.abs(change))  # tolerance of the linear solve: 1e-2
+
+
 def test_mesh_error_refuses_what_it_cannot_say():
     scene = _pull(1, 1)
     with pytest.raises(lj.InputError, match="remove start"):
         lj.simulate(scene, start=scene.mesh.points, mesh_error=True)
     with pytest.raises(lj.InputError, match="has an additional error"):
         lj.simulate(replace(scene, solve=lj.Solve(newton_iterations=1)), mesh_error=True)
+    with pytest.raises(lj.InputError, match=r"cannot be estimated inside jax\.jit if the mesh is an argument"):
+        jax.jit(lambda own: lj.simulate(own, mesh_error=True).mesh_error.positions)(scene)
 
 
 @pytest.mark.slow

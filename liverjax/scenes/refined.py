@@ -125,14 +125,24 @@ def on_refined_mesh(scene: Scene) -> tuple[Scene, Within]:
     return joined_entries(scene, made, partial(_between_groups, old, mesh), within.field), within
 
 
+def refuse_traced(mesh: TetMesh) -> None:
+    """Check that the node numbers of a mesh are known. They are unknown if the mesh is an argument of a compiled
+    function. A richer mesh cannot be made there.
+
+    Raises:
+        InputError: the node numbers are unknown.
+    """
+    if isinstance(mesh.tetrahedra, jax.core.Tracer) or isinstance(mesh.pattern.edges, jax.core.Tracer):
+        raise InputError(
+            "the mesh error cannot be estimated inside jax.jit if the mesh is an argument of the compiled function: "
+            "estimate the error outside jax.jit"
+        )
+
+
 def _mesh_and_within(old: TetMesh) -> tuple[TetMesh, Within]:
     """Return the refined mesh, and the positions of its nodes in the old mesh."""
+    refuse_traced(old)
     traced = isinstance(old.points, jax.core.Tracer)
-    if isinstance(old.tetrahedra, jax.core.Tracer) or isinstance(old.pattern.edges, jax.core.Tracer):
-        raise InputError(
-            "the mesh error of a scene with a fluid cannot be estimated inside jax.jit if the mesh is an argument of "
-            "the compiled function: estimate the error outside jax.jit"
-        )
     with nullcontext() if traced else jax.ensure_compile_time_eval():  # the node numbers must be known
         mesh = refined(replace(old, triangle_sets=None))
         element, place = places_in(old, mesh)

@@ -42,7 +42,7 @@ from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End
 from liverjax.scenes.by_element import sponge_at_points
 from liverjax.scenes.enriched import enriched
-from liverjax.scenes.refined import REFINED, Within, can_be_refined, on_refined_mesh
+from liverjax.scenes.refined import REFINED, Within, can_be_refined, on_refined_mesh, refuse_traced
 from liverjax.scenes.regions import changed_numbers, laws_of, refused_name
 from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.simulation import automatic, tangent
@@ -190,7 +190,7 @@ def richer(scene: Scene) -> Richer:
     """Create the scene in a richer space of functions (elements of the next order, or a refined mesh).
 
     Raises:
-        InputError: the mesh is loaded, or the scene uses the one-step scheme.
+        InputError: the mesh is loaded or an argument of a compiled function, or the scene uses the one-step scheme.
     """
     refuse(scene)
     if scene.porosity is not None and can_be_refined(scene):
@@ -221,7 +221,10 @@ def _with_richer_elements(scene: Scene) -> Scene:
 
 
 def _may_lock(scene: Scene) -> bool:
-    """Return whether bulk modulus / shear modulus exceeds `_LOCKS` in any material; True if the moduli are unknown."""
+    """Return whether bulk modulus / shear modulus exceeds `_LOCKS` in any material.
+
+    Inside `jax.jit` and `jax.vmap` the moduli may be unknown. Then the result is True.
+    """
     laws = list(laws_of(scene.law, scene.region))
     for region in scene.region:
         own = scene.law
@@ -232,9 +235,10 @@ def _may_lock(scene: Scene) -> bool:
         numbers = [(a.bulk_modulus(), a.shear_modulus()) for a in laws]
     except InputError:  # a law may have no moduli
         return True
-    if any(isinstance(a, jax.core.Tracer) for pair in numbers for a in pair):
+    try:
+        return any(bool(jnp.any(jnp.asarray(bulk) > _LOCKS * jnp.asarray(shear))) for bulk, shear in numbers)
+    except jax.errors.ConcretizationTypeError:
         return True
-    return any(bool(np.any(np.asarray(bulk) > _LOCKS * np.asarray(shear))) for bulk, shear in numbers)
 
 
 def refuse(scene: Scene) -> None:
@@ -244,8 +248,9 @@ def refuse(scene: Scene) -> None:
     error of the run cancel, but the estimate contains only the error of the run.
 
     Raises:
-        InputError: the mesh is loaded, or the scene uses the one-step scheme.
+        InputError: the mesh is loaded or an argument of a compiled function, or the scene uses the one-step scheme.
     """
+    refuse_traced(scene.mesh)
     if scene.points_are == "loaded":
         raise InputError(
             '[mesh] is = "loaded": the mesh error is unknown, because the reference shape also depends on the mesh: '
@@ -324,11 +329,20 @@ def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _S
     def solved(q: jax.Array) -> _Solved:
         f = forces(e, q, one)
         K = tangent.tangent(e, f.pressure, f.x, one)
+
+        def along(dq: jax.Array) -> jax.Array:
+            return jax.jvp(lambda q: residual(e, q, one)[0], (q,), (dq,))[1]
+
+        def solve(_: Callable, load: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+            dq, iterations, positive = tangent.solve(e, K, load, tolerance, MOST_LINEAR_ITERATIONS)
+            # The solver does not report every breakdown, so the true residual is checked.
+            ended = true_residual(tangent.product(e, K), load, dq) <= 10 * tolerance
+            return dq, (iterations, positive & ended)
+
+        # K is a constant for JAX. So JAX takes the derivative of K dq from `along`, which is the same product.
         load = -residual(e, q, one)[0]
-        dq, iterations, positive = tangent.solve(e, K, load, tolerance, MOST_LINEAR_ITERATIONS)
-        # The solver does not report every breakdown, so the true residual is checked.
-        ended = true_residual(tangent.product(e, K), load, dq) <= 10 * tolerance
-        return dq, iterations, positive & ended
+        dq, (iterations, positive) = jax.lax.custom_linear_solve(along, load, solve, has_aux=True)
+        return dq, iterations, positive
 
     flows = e.volume is not None and e.volume.flow is not None
     if not any(a.kinked for a in e.nodal) and not flows:

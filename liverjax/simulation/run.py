@@ -132,16 +132,17 @@ def simulate(
             `store` has no effect. See `liverjax.simulation.gradients`.
         mesh_error: whether to estimate the mesh error (`liverjax.simulation.mesh_error`). Then the run must begin at
             the reference positions, and the mesh must not be "loaded". The estimate can be differentiated in forward
-            mode only.
+            mode only. If the moduli are unknown inside jit or vmap, the estimate for linear elements uses the elements
+            for nearly incompressible bodies. For compressible bodies it then differs by some per cent.
 
     Raises:
         InputError: unknown choices; harmonic motion or a reduced model; a time step or a mass is missing; numbers out
             of bounds; a loaded mesh for which no reference shape is found; precision "float64" although JAX's 64-bit
             mode is off; a wrong shape of `start`; `mesh_error` together with a loaded mesh, `start` or the one-step
-            scheme. Inside jit, grad or vmap, numbers are not checked. If no reference shape is found there, the points
-            are NaN and the status of the steps is NOT_FINITE. `check_scene`, which is called when a scene file is read,
-            checks more: the mesh, the shear modulus, the positions of obstacles, and whether the supports prevent rigid
-            motions.
+            scheme, or inside jit if the mesh is an argument of the compiled function. Inside jit, grad or vmap, numbers
+            are not checked. If no reference shape is found there, the points are NaN and the status of the steps is
+            NOT_FINITE. `check_scene`, which is called when a scene file is read, checks more: the mesh, the shear
+            modulus, the positions of obstacles, and whether the supports prevent rigid motions.
     """
     if mesh_error:
         refuse(scene)
