@@ -146,6 +146,20 @@ def test_factors_of_two_tests_are_in_the_errors_or_told():
     assert np.sum(missed, axis=0)[0] <= 3 and np.sum(missed, axis=0)[1] == 0 and shown, missed
 
 
+def test_the_advice_for_one_test_of_two_samples_is_possible():
+    """The advice was to measure one test on several samples, although the user had done this."""
+    law, rng, two = lj.laws.NeoHookean(mu=1000.0, bulk=None), np.random.default_rng(11), []
+    stretch = np.linspace(1.05, 1.6, 12)
+    F = np.asarray(homogeneous.deformation_gradient("uniaxial", stretch, stretch))
+    exact = np.asarray(homogeneous.response(law, "uniaxial", stretch))
+    for name in ("a", "b"):
+        noisy = exact * (1 + 0.03 * rng.standard_normal(12))
+        two.append(curves.Curve(name, "uniaxial", F, (0, 0), noisy, file=f"{name}.csv"))
+    (candidate,) = stress_stretch.candidates("neo_hookean")
+    (said,) = (w for w in stress_stretch.fit(candidate, two, starts=4).warnings if "wrong by an individual factor" in w)
+    assert said.endswith("Measure more samples in this test")
+
+
 @pytest.mark.slow
 def test_numbers_of_the_other_sign_that_shear_cannot_tell_apart_are_told():
     """For Ogden's law with alpha = 6, simple shear is the same with alpha = -6. In tension the stress is 0.3 times as

@@ -189,6 +189,9 @@ def test_the_same_file_twice_is_refused(tmp_path, capsys):
         file.write_text("test,stretch,nominal_stress_Pa\n" + rows)
     assert main(["curves", "neo_hookean", *map(str, files), "--out", str(tmp_path)]) == 2
     assert "is the same measurement as" in capsys.readouterr().err
+    files[1].write_text("# a comment\n" + files[0].read_text())
+    assert main(["curves", "neo_hookean", *map(str, files), "--out", str(tmp_path)]) == 2
+    assert "b, uniaxial has the same numbers as a, uniaxial" in capsys.readouterr().err
 
 
 def test_remarks_after_the_numbers_and_a_second_heading_are_no_matter(tmp_path):

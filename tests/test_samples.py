@@ -215,6 +215,59 @@ def test_a_typical_sample_of_fluids_is_a_fluid():
     assert any(w.startswith("equilibrium_modulus: fewer than two") and w.endswith("is a fluid") for w in said)
 
 
+def test_small_equilibrium_moduli_within_their_errors_are_a_fluid():
+    """Four fluids had a population of 0.54 Pa with an interval of 0.096 to 3 Pa, without the true value 0."""
+    errors = np.array([0.56, 0.58, 0.6, np.inf])
+    assert population(np.array([1.1, 0.6, 0.42, 3e-10]), errors, additive=True) is None
+    rng = np.random.default_rng(0)
+    kept = []
+    for truth in ([0.0] * 4, [5.0] * 4, [0.0, 0.0, 5.0, 5.0], [2.0] * 6):
+        draws = np.maximum(0, truth + rng.standard_normal((100, len(truth))))
+        found = [population(x, np.where(x > 0, 1.0, np.inf), additive=True) for x in draws]
+        kept.append(np.mean([p is not None for p in found]))
+    assert kept[0] < 0.1 and min(kept[1:]) > 0.97, kept
+
+
+def test_fluids_are_a_candidate_for_all_samples(monkeypatch):
+    """`--model auto` compared no fluid, so fluids had the model of a solid."""
+    monkeypatch.setattr(samples.models, "fractional", lambda sweep: [])
+    found = samples.fit(fluids((1, 1.1, 0.9), (0.4, 0.4, 0.4)), "auto")
+    assert found.kind.name == "prony_fluid" and found.fits[0].modes == 2
+    assert float(found.typical.equilibrium_modulus) < 1e-5
+
+
+def test_samples_with_other_bands_are_warned_about():
+    """Their modes were averaged by their index. G'' of the typical sample was 0.4 of the measured one, without a
+    message."""
+    rng, sweeps = np.random.default_rng(1), []
+    for low, high in ((0.06, 6), (0.06, 6), (6, 600), (6, 600)):
+        omega = np.geomspace(low, high, 12)
+        modes = Maxwell(
+            np.float64(1000 * np.exp(0.1 * rng.standard_normal())), np.full(4, 0.2), 10.0 ** -np.arange(-1, 3)
+        )
+        storage, loss = np.array(generalised_maxwell.moduli(modes, omega)) * (1 + 0.01 * rng.standard_normal((2, 12)))
+        sweeps.append(Sweep(omega, storage, loss, source=f"b{len(sweeps)}.csv"))
+    (said,) = (
+        w for w in samples_report.warnings(samples.fit(sweeps, "prony", 3)) if "of the typical sample differs" in w
+    )
+    assert "different bands (0.00955 to 0.955 Hz, 0.955 to 95.5 Hz)" in said and "--max-frequency" in said
+    same = samples_report.warnings(samples.fit(sweeps[:2], "prony", 3))
+    assert not any("of the typical sample differs" in w for w in same)
+
+
+def test_a_typical_springpot_has_the_mean_modulus():
+    """All samples have |G*| = 5000 Pa at 300 Hz, but the typical sample had 4865 Pa near this frequency."""
+    centre = 2 * np.pi * 300
+    omega = centre * np.geomspace(1 / 3, 3, 9)
+    sweeps = []
+    for exponent in (0.2, 0.3, 0.25, 0.4):
+        G = 5000 * (1j * omega / centre) ** exponent
+        sweeps.append(Sweep(omega, G.real, G.imag, source=f"p{len(sweeps)}.csv"))
+    found = samples.fit(sweeps, "fractional")
+    assert found.kind.name == "springpot" and np.isclose(found.populations["exponent"].mean, 0.2875, rtol=1e-3)
+    assert np.isclose(np.hypot(*generalised_maxwell.moduli(found.typical, omega))[4], 5000, rtol=0.01)
+
+
 def test_a_spectrum_of_another_stiffness_is_named():
     """No parameter was compared, because a spectrum of a fluid has only strengths."""
     found = samples.fit(fluids((5, 1, 1.1, 0.9, 1.05, 0.95), [0.4] * 6), "spectrum")
@@ -343,7 +396,12 @@ def test_the_command_fits_each_sample_and_the_population(tmp_path, capsys):
         assert np.all(np.abs(np.array(found) - truth) < 4 * np.array(errors))
         share = np.hypot(50e-6 / 0.002, 4 * 10e-6 / 0.01) * found[0]  # usual errors of gap and radius
         assert sample["total_errors"]["shear_modulus"] >= np.hypot(share, errors[0]) * (1 - 1e-6)
-    p = content["population"]["shear_modulus"]
+    p, errors = content["population"]["shear_modulus"], content["standard_errors"]
+    quantile = scipy.stats.t.ppf(0.975, 4)  # the keys of a single fit were missing
+    half = np.diff(np.log(p["interval_95_of_the_mean"]))[0] / 2
+    assert np.isclose(errors["shear_modulus"], content["shear_modulus"] * half / quantile, rtol=1e-6)
+    assert set(errors) == {"shear_modulus", "equilibrium_modulus", "ratios", "relaxation_times"}
+    assert 0 < errors["ratios"][0] < 0.3 and errors["relaxation_times"][0] > 0 and content["correlation"] is None
     logs = np.log(truths[:, 0])  # the true values of these five, known to 1 %
     assert np.isclose(np.log(p["mean"]), logs.mean(), atol=0.02)
     assert np.isclose(p["spread_of_logarithms"], logs.std(ddof=1), atol=0.02)

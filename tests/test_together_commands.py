@@ -107,3 +107,7 @@ def test_one_measurement_does_not_count_twice(tmp_path, capsys):
         paths = [str(tmp_path / a) if a.endswith("csv") else a for a in arguments]
         assert main([*paths, "--out", str(tmp_path / "o")]) == 2
         assert "is the same measurement as" in capsys.readouterr().err
+    # A copy with another comment was accepted, and the errors were too small.
+    (tmp_path / "c.csv").write_text("# a comment\n" + (tmp_path / "a.csv").read_text())
+    assert main([str(tmp_path / "a.csv"), "--with", str(tmp_path / "c.csv"), "--out", str(tmp_path / "o")]) == 2
+    assert "has the same numbers as" in capsys.readouterr().err

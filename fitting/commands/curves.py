@@ -48,6 +48,7 @@ def run(options: argparse.Namespace) -> int:
     shared_options.refuse_copies(options.files)
     candidates = hyperelastic.candidates(options.law, options.terms)
     found, notes = curves.read_curves(options.files, options.unit or "Pa")
+    shared_options.refuse_equal_numbers([(c.label, (c.test, c.component, c.F, c.stress)) for c in found])
     if options.unit and not any("names no unit" in note for note in notes):
         notes.append(f"--unit {options.unit} has no effect, because the headings of the stress columns contain a unit")
     if options.law == "all":

@@ -15,6 +15,8 @@ from liverjax.core.errors import InputError
 from liverjax.core.files import writable
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from fitting.fits.stress_stretch import LawFit
     from fitting.fits.viscoelastic import Fit, Kind
     from fitting.methods.estimate import Estimate
@@ -37,6 +39,16 @@ def refuse_copies(files: list[Path]) -> None:
         first = seen.setdefault(file.read_bytes(), file)
         if first is not file:
             raise InputError(f"{file} is the same measurement as {first}: give each measurement once")
+
+
+def refuse_equal_numbers(measured: "list[tuple[str, tuple[ArrayLike, ...]]]") -> None:
+    """Raise an error if two measurements have the same numbers, because one measurement would count twice. Their files
+    may differ, for example in a comment. `measured`: name and arrays of each measurement."""
+    for k, (name, arrays) in enumerate(measured):
+        for earlier, others in measured[:k]:
+            equal = (np.array_equal(a, b) for a, b in zip(arrays, others, strict=False))
+            if len(arrays) == len(others) and all(equal):
+                raise InputError(f"{name} has the same numbers as {earlier}: give each measurement once")
 
 
 def laws_without_finite_stress(fits: "list[LawFit]", data: str) -> list[str]:

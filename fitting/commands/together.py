@@ -18,10 +18,13 @@ if TYPE_CHECKING:
 def run(options: argparse.Namespace) -> int:
     """Fit all tests in closed form. The exit code is 1 if the fit did not converge."""
     from fitting.fits.families import springpots_in_time
+    from fitting.fits.together.measured_tests import name_of, reported_numbers
     from fitting.reports import together_report
 
     first = shared_options.usable_sweep(options, options.sweep[0])
     tests = [first, *(read_any(options, path) for path in options.others)]
+    rows = [(t, *reported_numbers(t)[:2]) for t in tests]
+    shared_options.refuse_equal_numbers([(t.source, (name_of(t), *at, values)) for t, at, values in rows])
     tests = without_sample_inertia(tests, options.density, options.height)
     for test in tests:
         for note in test.notes:

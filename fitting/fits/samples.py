@@ -14,7 +14,7 @@ from fitting.fits.honesty import edges
 from fitting.fits.viscoelastic import Fit, Kind, information_criterion
 from fitting.methods import as_prony_modes, generalised_maxwell, relaxation_spectrum, springpots, uncertainty
 from fitting.methods.generalised_maxwell import Maxwell, Spectrum
-from fitting.methods.population import Population, population
+from fitting.methods.population import ABOVE_ZERO, Population, population
 from fitting.readers.rheometer import Sweep
 from liverjax.core.errors import InputError
 
@@ -76,6 +76,9 @@ def fit(
     tried: list[_Candidate] = []
     if model in ("prony", "auto"):
         tried += _modes_for_all(sweeps, dense, modes, progress)
+        solids = min(tried, key=lambda c: c.criterion).fits
+        if model == "auto" and 2 * sum(uncertainty.may_be_fluid(f.uncertainty) for f in solids) >= len(sweeps):
+            tried += _modes_for_all(sweeps, dense, modes, progress, viscoelastic.FLUID)
     if model in ("fractional", "auto"):
         progress("springpots")
         every = [{f.kind.name: f for f in models.fractional(s)} for s in sweeps]
@@ -113,10 +116,11 @@ def _candidate_for_all(sweeps: list[Sweep], fits: list[Fit], label: dict) -> _Ca
 
 
 def _modes_for_all(
-    sweeps: list[Sweep], dense: list[Spectrum], modes: int | str, progress: Callable
+    sweeps: list[Sweep], dense: list[Spectrum], modes: int | str, progress: Callable, kind: Kind = Kind()
 ) -> list[_Candidate]:
-    """Return the fits of all samples with 1, 2, … Prony modes. The search ends after an exact fit. It also ends after
-    two failures in a row: the fits do not lower the summed criterion, or most samples do not determine the modes."""
+    """Return the fits of all samples with 1, 2, … Prony modes of a solid or a fluid (`kind`). The search ends after an
+    exact fit. It also ends after two failures in a row: the fits do not lower the summed criterion, or most samples do
+    not determine the modes."""
     largest = min(generalised_maxwell.largest_number_of_modes(s) for s in sweeps)
     for s in sweeps:
         viscoelastic.check_modes(s, 1 if modes == "auto" else modes)
@@ -127,8 +131,9 @@ def _modes_for_all(
     failures = 0
     for n in numbers:
         progress(f"{n} modes")
-        fits = [viscoelastic.closed_form(s, n, d) for s, d in zip(sweeps, dense, strict=True)]
-        tried.append(_candidate_for_all(sweeps, fits, {"model": "prony", "modes": n}))
+        starts = [models.starts_of_kind(kind, s, n, d) for s, d in zip(sweeps, dense, strict=True)]
+        fits = [viscoelastic.modes_from(s, u, kind) for s, u in zip(sweeps, starts, strict=True)]
+        tried.append(_candidate_for_all(sweeps, fits, {"model": kind.name, "modes": n}))
         lower = tried[-1].able and tried[-1].criterion <= min(c.criterion for c in tried)
         failures = 0 if lower or len(tried) == 1 else failures + 1
         exact = max(np.max(f.relative_errors(s)) for f, s in zip(fits, sweeps, strict=True)) < viscoelastic.EXACT
@@ -153,13 +158,37 @@ def _populations(fits: list[Fit]) -> dict[str, Population | None]:
     # The spectrum of the first sample may have no equilibrium modulus.
     for name in (*dict.fromkeys(n for row in known for n in row if "[" not in n), *names):
         pairs = np.array([row.get(name, (0.0, np.inf)) for row in known])
-        # The equilibrium modulus is a small difference of larger moduli, so its error hardly depends on its value.
-        found = population(pairs[:, 0], pairs[:, 1], additive=name == "equilibrium_modulus")
+        if "exponent" in name:
+            found = _of_exponents(pairs[:, 0], pairs[:, 1])
+        else:
+            # The equilibrium modulus is a small difference of larger moduli: its error hardly depends on its value.
+            found = population(pairs[:, 0], pairs[:, 1], additive=name == "equilibrium_modulus")
         if found is not None and (name.startswith("ratios[") or "exponent" in name):  # these cannot exceed 1
             of_mean, of_new = ((low, min(1.0, high)) for low, high in (found.mean_interval, found.new_interval))
             found = found._replace(mean_interval=of_mean, new_interval=of_new)
         out[name] = found
     return out
+
+
+def _of_exponents(values: np.ndarray, errors: np.ndarray) -> Population | None:
+    """Return the population of an exponent. Its mean is an arithmetic mean, because log|G*| is linear in the exponent.
+    The spread is the standard deviation between samples, divided by the mean."""
+    known = (values > 0) & (errors < 10 * values)
+    size = np.exp(values)
+    p = population(size, np.where(known, size * errors, np.inf))
+    if p is None or p.mean <= 1:
+        return None
+    mean, pooled = float(np.log(p.mean)), np.maximum(np.log(p.pooled), 1e-300)
+    low, high = (np.maximum(np.log(ends), 0.0).tolist() for ends in zip(p.mean_interval, p.new_interval, strict=True))
+    return Population(
+        mean=mean,
+        spread=p.spread / mean,
+        mean_interval=(low[0], high[0]),
+        new_interval=(low[1], high[1]),
+        pooled=pooled,
+        pooled_errors=p.pooled_errors / pooled,
+        mean_error=p.mean_error / mean,
+    )
 
 
 #: _STRANGE: a sample is reported as an outlier if the probability that any of the samples differs so much by chance is
@@ -288,7 +317,7 @@ def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str,
         rest = mean.get("equilibrium_modulus", 0.0) / mean["shear_modulus"]
         factor = (1 - max(rest, 1e-9)) / max(ratios.sum(), 1e-300)
         value, error = np.array([row.get("equilibrium_modulus", (0.0, np.inf)) for row in every]).T
-        decided = rest < 1 and (rest > 0 or not np.any(value > 2 * error))
+        decided = rest < 1 and (rest > 0 or not np.any(value > ABOVE_ZERO * error))
         ratios = ratios * (factor if decided and len(known) == fits[0].modes else min(1.0, factor))
         return Maxwell(mean["shear_modulus"], ratios, times)  # type: ignore[arg-type]
     low, high = min(s.angular_frequency[0] for s in sweeps), max(s.angular_frequency[-1] for s in sweeps)

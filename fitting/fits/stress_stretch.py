@@ -215,8 +215,8 @@ def assessed(
         limits=limits,
     )
     told = [*_warnings(result, curves, s, bool(np.any(r[n:] < 0))), *out_of_bounds(candidate, values, limits)]
-    told += _of_noise(alike, factors, n, tests := len({c.sample or c.label for c in curves}))
-    told += _of_hidden_factors(factors, tests, np.array(candidate.names)[known], values[known], errors[known])
+    told += _of_noise(alike, factors, n, len({c.sample or c.label for c in curves}))
+    told += _of_hidden_factors(factors, curves, np.array(candidate.names)[known], values[known], errors[known])
     if of_tests and not limits:
         told += _of_other_minima(candidate, values, np.asarray(found.u)[costs <= lowest], scale, curves)
     return result._replace(warnings=told)
@@ -268,22 +268,26 @@ def _of_noise(alike: Alike | None, factors: list[FactorNoise], n: int, tests: in
 
 
 def _of_hidden_factors(
-    every: list[FactorNoise], tests: int, names: np.ndarray, values: np.ndarray, errors: np.ndarray
+    every: list[FactorNoise], curves: list[Curve], names: np.ndarray, values: np.ndarray, errors: np.ndarray
 ) -> list[str]:
     """Return a warning about factors that may multiply the stress of each test, but that the residuals do not show. The
     parameters compensate such factors."""
+    tests = len({c.sample or c.label for c in curves})
     if not every or every[0].series != tests or any(own.shown for own in every):
         return []
     factors = every[0]
     much = (factors.moves > _HIDDEN * errors) & (factors.moves > _MOVED * np.abs(values))
     if not np.any(much):
         return []
+    remedy = "Measure all tests on one sample, or one test on several samples"
+    if len({(c.test, c.component) for c in curves}) == 1:
+        remedy = "Measure more samples in this test"
     worst = int(np.argmax(np.where(much, factors.moves / np.maximum(errors, 1e-300), 0.0)))
     return [
         "the stress of each test may be wrong by an individual factor, for example due to another sample or a wrong "
         f"size of the sample. The residuals hardly show such factors, but factors of {100 * factors.hidden:.2g} % "
         f"change {names[worst]} by about {factors.moves[worst]:.2g}, and {values[worst]:.4g} ± {errors[worst]:.2g} "
-        "does not contain this change. Measure all tests on one sample, or one test on several samples"
+        f"does not contain this change. {remedy}"
     ]
 
 

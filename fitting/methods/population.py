@@ -37,6 +37,11 @@ NEAR_ZERO = 0.1
 #: A value near 0 is part of the population only if it may be larger than `NEAR_ZERO` times the median (within two
 #: errors), or if its error, divided by the median, exceeds this value.
 MAY_BE_ZERO = 0.2
+#: A value with an additive error is certainly above 0 if it exceeds this number of standard errors.
+ABOVE_ZERO = 3.0
+#: Values with additive errors are together compatible with 0 if their weighted sum exceeds the sum that is expected
+#: from errors alone by less than this number of standard deviations (`_compatible_with_zero`).
+ZERO_BY_CHANCE = 2.0
 #: Largest number of rounds in which the moved values and the population are computed in turn.
 ROUNDS_OF_MOVING = 50
 
@@ -50,12 +55,13 @@ class Population(NamedTuple):
     new_interval: tuple[float, float]  # interval of a new sample
     pooled: np.ndarray  # (n,) values of the samples, moved towards the mean; NaN: see `BELOW`, `NEAR_ZERO`
     pooled_errors: np.ndarray  # (n,) standard deviations of the logarithms of `pooled`
+    mean_error: float  # standard error of the logarithm of the mean: half of `mean_interval` over Student's quantile
 
 
 def population(values: np.ndarray, errors: np.ndarray, additive: bool = False) -> Population | None:
     """Estimate mean and spread of the population from values (n,), which are not negative, with standard errors (n,).
     Returns None if fewer than two values are determined. `additive`: the errors do not grow with the values, and a
-    value may be 0 (`_as_logarithms`)."""
+    value may be 0 (`_as_logarithms`). Then the result is also None if all values together are compatible with 0."""
     values, errors = np.asarray(values, float), np.asarray(errors, float)
     if values.ndim != 1 or values.shape != errors.shape or np.any(errors < 0):
         raise InputError(
@@ -70,7 +76,7 @@ def population(values: np.ndarray, errors: np.ndarray, additive: bool = False) -
         unsure &= ~np.isfinite(errors)
         errors = _with_errors_of_zeros(values, errors, known)
         known = (values >= 0) & np.isfinite(values) & np.isfinite(errors)
-        if known.sum() < 2:
+        if known.sum() < 2 or _compatible_with_zero(values[known], errors[known]):
             return None
         y, v = _as_logarithms(values[known], errors[known])
     else:
@@ -78,8 +84,8 @@ def population(values: np.ndarray, errors: np.ndarray, additive: bool = False) -
     variance = _variance_between(y, v)
     mean, sd = _weighted_mean(y, v, variance)
     n = len(y)
-    half = float(scipy.stats.t.ppf(0.975, n - 1)) * sd
-    half_new = float(scipy.stats.t.ppf(0.975, n - 1)) * float(np.hypot(np.sqrt(variance), sd))
+    quantile = float(scipy.stats.t.ppf(0.975, n - 1))
+    half, half_new = quantile * sd, quantile * float(np.hypot(np.sqrt(variance), sd))
     intervals = (mean - half, mean + half), (mean - half_new, mean + half_new)
     over = _over_spreads(y, v)
     w = 1 / (v + variance)
@@ -101,7 +107,19 @@ def population(values: np.ndarray, errors: np.ndarray, additive: bool = False) -
         new_interval=new_interval,
         pooled=np.exp(pooled),
         pooled_errors=pooled_errors,
+        mean_error=(intervals[0][1] - intervals[0][0]) / (2 * quantile),
     )
+
+
+def _compatible_with_zero(values: np.ndarray, errors: np.ndarray) -> bool:
+    """Return whether the values (n,) may all be 0 except for their errors. Negative values were replaced by 0. So each
+    value has the distribution of max(0, e z), where e is the error and z is a standard normal variable."""
+    errors = np.maximum(errors, 1e-300)
+    if np.any(values > ABOVE_ZERO * errors):
+        return False
+    mean = 1 / np.sqrt(2 * np.pi)  # of max(0, z)
+    excess = np.sum((values / errors - mean) / errors)
+    return bool(excess < ZERO_BY_CHANCE * np.sqrt((0.5 - mean**2) * np.sum(errors**-2.0)))
 
 
 def _with_errors_of_zeros(values: np.ndarray, errors: np.ndarray, known: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ from fitting.fits.families import limits
 from fitting.fits.honesty import edges, total_error
 from fitting.fits.samples import Samples, outliers
 from fitting.fits.viscoelastic import SHORT
+from fitting.methods import generalised_maxwell
 from fitting.methods.population import BELOW
 from fitting.readers.rheometer import WARMER
 from fitting.readers.units import celsius
@@ -36,11 +37,10 @@ def write(out: Path, found: Samples) -> Content:
 def _json_content(found: Samples) -> Content:
     """Return the content of fit.json: first the model of a typical sample, then the population and all samples."""
     typical, errors = found.typical, np.concatenate([f.relative_errors(s) for f, s in _pairs(found)])
-    own = (
-        {}
-        if found.kind.values is None
-        else {"parameters": {n: {"value": p.mean} for n, p in _known_errors(found).items()}}
-    )
+    own: Content = {}
+    if found.kind.values is not None:
+        rows = _known_errors(found).items()
+        own = {"parameters": {n: {"value": p.mean, "standard_error": p.mean * p.mean_error} for n, p in rows}}
     rest = float(typical.shear_modulus * (1 - np.sum(np.asarray(typical.ratios))))
     return {
         "method": "closed-form",
@@ -51,7 +51,9 @@ def _json_content(found: Samples) -> Content:
         "equilibrium_modulus": max(0.0, rest),
         "ratios": np.asarray(typical.ratios).tolist(),
         "relaxation_times": np.asarray(typical.relaxation_times).tolist(),
+        "standard_errors": _errors_of_typical(found),
         **own,
+        "correlation": None,  # the populations of the parameters are estimated one by one
         "population": {name: _population(p) for name, p in found.populations.items()},
         "details": {"spectrum": _times_of_strengths(found)} if found.kind.effective is not None else {},
         "samples": [_sample_entry(found, k) for k in range(len(found.fits))],
@@ -63,6 +65,30 @@ def _json_content(found: Samples) -> Content:
         "compile_time_s": sum(f.compile_time for f in found.fits),
         "versions": versions(),
     }
+
+
+def _errors_of_typical(found: Samples) -> Content:
+    """Return the standard errors of the numbers of the typical sample, under the names for one sample. They are the
+    errors of the means of the populations. The error of a modulus also contains its difference from the mean.
+    An error is None if it is unknown. If the model has no free Prony modes, the modes represent the means of other
+    parameters, so the errors of the modes are unknown."""
+    relative = {name: p.mean_error for name, p in _known_errors(found).items()}
+    typical = found.typical
+
+    def error_of(value: float, name: str) -> float | None:
+        return value * relative[name] if name in relative else None
+
+    known = [f"[{k}]" for k in range(len(found.populations)) if f"ratios[{k}]" in relative]
+    names = [place for place in known if f"relaxation_times{place}" in relative]
+    out: Content = {}
+    for name, value in limits.of_the_modes(typical).items():
+        p = found.populations.get(name)
+        out[name] = None if p is None else float(np.hypot(p.mean * p.mean_error, p.mean - value))
+    for stem, values in (("ratios", typical.ratios), ("relaxation_times", typical.relaxation_times)):
+        places = names if found.kind.values is None else ["" for _ in values]
+        rows = zip(np.asarray(values).tolist(), places, strict=True)
+        out[stem] = [error_of(value, stem + place) for value, place in rows]
+    return out
 
 
 def _times_of_strengths(found: Samples) -> Content:
@@ -128,6 +154,8 @@ COUNTED = (
     ("use fewer modes", "a mode is not needed or not determined"),
 )
 
+#: Two samples have different bands if the logarithms of the ends of their bands differ by more than this value.
+OTHER_BAND = 0.7
 #: A typical sample is called a fluid if its equilibrium modulus, divided by G0, is below this value.
 FLUID_BELOW = 1e-6
 
@@ -147,8 +175,10 @@ def warnings(found: Samples) -> list[str]:
             )
         elif p is None:
             typical = ", and the typical sample is a fluid" if name == "equilibrium_modulus" and fluid else ""
+            or_zero = " or its values may all be 0" if name == "equilibrium_modulus" else ""
             out.append(
-                f"{name}: fewer than two samples determine this parameter, so its mean and spread are unknown{typical}"
+                f"{name}: fewer than two samples determine this parameter{or_zero}, so its mean and spread are "
+                f"unknown{typical}"
             )
         else:
             if p.spread == 0:
@@ -163,6 +193,7 @@ def warnings(found: Samples) -> list[str]:
                     "another frequency band), so mean and spread are computed from the other samples"
                 )
     out += _limits_of_typical(found)
+    out += _moduli_of_typical(found)
     out += outliers(found)
     columns = [s.raw["temperature"] for s in found.sweeps if s.raw and "temperature" in s.raw]
     heat = np.array([np.nanmean(column) for column in columns if np.any(np.isfinite(column))])
@@ -206,6 +237,48 @@ def _limits_of_typical(found: Samples) -> list[str]:
         f"the equilibrium modulus of the typical sample's Prony modes is {rest:.4g} Pa, but the population mean is "
         f"{p.mean:.4g} Pa: {why}"
     ]
+
+
+#: A warning is given if G' or G'' of the typical sample differs from the mean of the samples by more than this value
+#: plus the standard error of this mean (mean differences of logarithms over the band of a sample).
+FAR_FROM_MEAN = 0.2
+
+
+def _moduli_of_typical(found: Samples) -> list[str]:
+    """Return a warning if the moduli of the typical sample are far from the geometric means of the fitted moduli. For
+    example, the modes with one index have other relaxation times in samples that were measured over other bands."""
+    bands = [np.log(s.angular_frequency) for s in found.sweeps]
+    worst, where = 0.0, 0
+    for k, at in enumerate(bands):
+        moduli = np.log(np.maximum(generalised_maxwell.moduli(found.typical, np.exp(at)), 1e-300))
+        for typical, name in zip(moduli, ("storage", "loss"), strict=True):
+            logs = [np.log(np.maximum(getattr(fit, name), 1e-300)) for fit in found.fits]
+            pairs = zip(bands, logs, strict=True)
+            every = np.stack([np.interp(at, own, log, left=np.nan, right=np.nan) for own, log in pairs])
+            count = np.isfinite(every).sum(axis=0)  # samples that were measured at each frequency
+            mean = np.nansum(every, axis=0) / count
+            variance = np.nansum((every - mean) ** 2, axis=0) / np.maximum(count - 1, 1)
+            apart = float(np.abs(typical - mean).mean())
+            if apart > max(worst, FAR_FROM_MEAN + np.sqrt(variance / count).mean()):
+                worst, where = apart, k
+    return [_far_typical(found, worst, where)] if worst else []
+
+
+def _far_typical(found: Samples, apart: float, where: int) -> str:
+    """Return the warning that the moduli of the typical sample differ from the mean moduli in the band of sample
+    `where`. `apart`: mean difference of the logarithms."""
+    ends = np.array([s.angular_frequency[[0, -1]] for s in found.sweeps]) / (2 * np.pi)
+    why = "the means of the parameters do not describe such different samples; use the fits of the single samples"
+    if np.any(np.abs(np.log(ends / ends[0])) > OTHER_BAND):
+        bands = sorted({f"{low:.3g} to {high:.3g} Hz" for low, high in ends})
+        why = (
+            f"the samples have different bands ({', '.join(bands)}), so their parameters have different meanings; fit "
+            "only samples with the same band together, or give a common band with --min-frequency and --max-frequency"
+        )
+    return (
+        f"G' or G'' of the typical sample differs from the mean of the samples by a factor of {np.exp(apart):.2g} on "
+        f"average over the band of {Path(found.sweeps[where].source).name}: {why}"
+    )
 
 
 def table(found: Samples) -> str:
