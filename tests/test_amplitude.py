@@ -1,6 +1,7 @@
 """Strain sweeps: the cycle against closed forms and a transient run, recovery of laws, files, the command."""
 
 import json
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +13,7 @@ from fitting.amplitude import cycle, law_fit, strain_sweep
 from fitting.fits import stress_stretch
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers import rheometer
+from fitting.reports import amplitude_report
 from liverjax.core.errors import InputError
 
 pytestmark = pytest.mark.quick_to_compile
@@ -102,6 +104,20 @@ def tanned():
     """A stiffening law, its memory, and a loss tangent of 0.2."""
     law = lj.laws.FungDemiray(c1=jnp.asarray(900.0), c2=jnp.asarray(1.5), bulk=None)
     return law, law_fit.Memory().of(2 * np.pi), jnp.array([1.0, 0.2])
+
+
+def test_the_axis_of_a_law_without_a_third_harmonic_points_upwards():
+    """All third harmonics were roundoff. The lower end of the axis was above the upper end."""
+    strain, moduli = np.geomspace(0.1, 50, 5) / 100, np.full(5, 300.0)
+    fit = SimpleNamespace(
+        law=SimpleNamespace(label="neo-Hookean", mean_relative_error=0.01),
+        storage=moduli,
+        loss=moduli,
+        third=np.full(5, 1e-15),
+    )
+    figure = amplitude_report.figure(SimpleNamespace(strain=strain, storage=moduli, loss=moduli), [fit])
+    low, high = figure.axes[1].get_ylim()
+    assert low == pytest.approx(1e-4) and high == pytest.approx(1e-3)
 
 
 @pytest.mark.ci

@@ -2,6 +2,7 @@
 
 import re
 import tomllib
+import types
 import xml.etree.ElementTree as ET
 
 import numpy as np
@@ -9,6 +10,8 @@ import pytest
 from conftest import ROOT
 
 from fitting.__main__ import main
+from fitting.commands import shared_options
+from fitting.fits.honesty.long_times import INTERVAL
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.reports import material_cards
 from liverjax.scenes.scene_file import scene_from
@@ -141,12 +144,40 @@ def test_the_command_gives_the_error_of_the_equilibrium_modulus_to_the_cards(tmp
     noise = 1 + 0.005 * np.random.default_rng(3).standard_normal((2, 20))
     omega = 2 * np.pi * np.geomspace(0.1, 20, 20)
     G = complex_modulus(0.0, [660.0, 440.0], [0.5, 0.03], omega)
-    rows = [f"{w},{p},{q}" for w, p, q in zip(omega, G.real * noise[0], G.imag * noise[1], strict=True)]
-    (tmp_path / "s.csv").write_text("\n".join(["angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa", *rows]))
-    command = [str(tmp_path / "s.csv"), "--method", "closed-form", "--modes", "2", "--cards"]
+    command = [csv_of(tmp_path / "s.csv", G, omega, noise), "--method", "closed-form", "--modes", "2", "--cards"]
     assert main([*command, "--out", str(tmp_path / "out")]) == 0
     told = capsys.readouterr().err
     assert "cannot be distinguished from zero (a fluid)" in told and "the card for SOFA contains G0 = 1100 Pa" in told
+
+
+def csv_of(path, G, omega, noise):
+    rows = [f"{w},{p},{q}" for w, p, q in zip(omega, G.real * noise[0], G.imag * noise[1], strict=True)]
+    path.write_text("\n".join(["angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa", *rows]))
+    return str(path)
+
+
+def test_the_card_of_several_fluids_is_no_soft_solid(tmp_path, capsys):
+    """The card contained an equilibrium modulus of 0.5 Pa, without a note. G0 is 1100 Pa."""
+    omega, rng = 2 * np.pi * np.geomspace(0.1, 20, 20), np.random.default_rng(3)
+    G, files = complex_modulus(0.0, [660.0, 440.0], [0.5, 0.03], omega), []
+    for scale in (0.9, 1.0, 1.1):
+        noise = 1 + 0.005 * rng.standard_normal((2, 20))
+        files.append(csv_of(tmp_path / f"s{scale}.csv", scale * G, omega, noise))
+    assert main([*files, "--modes", "2", "--cards", "--out", str(tmp_path / "out")]) == 0
+    assert "the card for SOFA contains G0 = 1" in capsys.readouterr().err
+    shear = re.search(r'ParameterSet="(\S+)', (tmp_path / "out" / "cards" / "sofa.xml").read_text())[1]
+    assert float(shear) == pytest.approx(1094, rel=0.02)
+
+
+def test_the_card_of_sofa_follows_the_interval_of_the_equilibrium_modulus(tmp_path, capsys):
+    """The interval was 0 to 120 Pa, but the card contained 120 Pa without a note."""
+    model = Maxwell(np.array(850.0), np.array([0.4, 0.45]), np.array([0.5, 0.03]))
+    spread = types.SimpleNamespace(values=np.array([850.0, 0.4, 0.45, 0.5, 0.03]), root=np.eye(5) * 1e-6)
+    for low in (0.0, 90.0):
+        details = {INTERVAL: {"low": low, "high": 130.0}}
+        fit = types.SimpleNamespace(model=model, uncertainty=spread, details=details)
+        shared_options.write_cards_of_fit(tmp_path, fit)
+        assert ("the card for SOFA contains G0 = 850 Pa" in capsys.readouterr().err) == (low == 0)
 
 
 def test_the_command_writes_them(tmp_path, capsys):

@@ -13,6 +13,7 @@ from conftest import ROOT
 from fitting.__main__ import main
 from fitting.fits import instrument, posterior, simulated_rheometer, viscoelastic
 from fitting.fits.families import models
+from fitting.fits.honesty import alike_points
 from fitting.methods import generalised_maxwell, springpots, uncertainty
 from fitting.methods.least_squares import levenberg_marquardt
 from fitting.methods.sampling import tempering
@@ -127,6 +128,21 @@ def test_noise_of_different_size_in_the_two_moduli_is_weighted():
     assert fit.noise_root is not None
     draws = posterior.of_sweep(fit, s, 200).draws.reshape(-1, 4)[:, 1]
     assert draws.std() < 1.2 and abs(draws.mean() - 420) < 3 * draws.std()
+
+
+def test_other_weights_than_those_in_the_file_are_told():
+    """The deviations in the file are not noise. The posterior used other weights than the fit, without a message."""
+    noise, omega = 1 + 0.02 * np.random.default_rng(0).standard_normal((2, 16)), 2 * np.pi * np.geomspace(0.1, 20, 16)
+    x = 0.1j * omega
+    G = 300 + 400 * x / (1 + x)
+    sweep = Sweep(omega, G.real * noise[0], G.imag * noise[1])
+    in_file = sweep._replace(storage_sd=0.02 * sweep.storage, loss_sd=1.2 * sweep.loss)
+    fit = viscoelastic.closed_form(in_file, 1)
+    (told,) = alike_points.posterior_cautions(fit, in_file)
+    assert "does not use the deviations in the file as weights" in told
+    # Neither smaller deviations, which are noise, nor a sweep without deviations need this warning.
+    for other in (sweep, in_file._replace(loss_sd=0.02 * sweep.loss)):
+        assert not alike_points.posterior_cautions(viscoelastic.closed_form(other, 1), other)
 
 
 def test_the_error_of_the_inertia_is_drawn_with_its_prior():

@@ -210,7 +210,9 @@ def test_a_typical_sample_of_fluids_is_a_fluid():
     """The means of the ratios left an equilibrium modulus of 108 Pa, without a message."""
     found = samples.fit(fluids((1, 1, 1), (0.25, 0.5, 0.75)), "prony", 2)
     assert all(found.values(k)["equilibrium_modulus"][0] < 1 for k in range(3))
-    assert float(found.typical.equilibrium_modulus) < 1e-5 and np.isclose(found.typical.ratios[0], 0.5, rtol=0.03)
+    # An equilibrium modulus of a millionth of a Pa was reported.
+    assert samples_report._json_content(found)["equilibrium_modulus"] == 0 and found.mostly_fluids
+    assert float(found.typical.equilibrium_modulus) < 1e-9 and np.isclose(found.typical.ratios[0], 0.5, rtol=0.03)
     said = samples_report.warnings(found)
     assert any(w.startswith("equilibrium_modulus: fewer than two") and w.endswith("is a fluid") for w in said)
 
@@ -266,6 +268,16 @@ def test_a_typical_springpot_has_the_mean_modulus():
     found = samples.fit(sweeps, "fractional")
     assert found.kind.name == "springpot" and np.isclose(found.populations["exponent"].mean, 0.2875, rtol=1e-3)
     assert np.isclose(np.hypot(*generalised_maxwell.moduli(found.typical, omega))[4], 5000, rtol=0.01)
+
+
+def test_the_report_contains_every_parameter_of_the_typical_sample():
+    """A parameter without a mean was left out, although the median of the samples was used for the Prony modes."""
+    found = samples.fit(fluids((1, 1.1), (0.5, 0.5)), "fractional")
+    found = found._replace(populations=found.populations | {"slow_exponent": None})
+    own = samples_report._json_content(found)["parameters"]
+    median = np.median([found.values(k)["slow_exponent"][0] for k in range(2)])
+    assert list(own) == list(found.populations) and own["slow_exponent"]["value"] == median
+    assert own["slow_springpot"]["value"] == found.populations["slow_springpot"].mean
 
 
 def test_a_spectrum_of_another_stiffness_is_named():

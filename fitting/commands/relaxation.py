@@ -139,7 +139,7 @@ def run(options: argparse.Namespace) -> int:
 
         print(posterior_report.table(posterior))
     if options.cards:
-        shared_options.write_cards(out, found.model, found.uncertainty)
+        shared_options.write_cards_of_fit(out, found)
     for sentence in content["warnings"]:
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"written: {out}/fit.json, fit.png")

@@ -42,7 +42,7 @@ def run(options: argparse.Namespace) -> int:
     content = samples_report.write(options.out, found)
     print(samples_report.table(found))
     if options.cards:
-        shared_options.write_cards(options.out, found.typical)
+        shared_options.write_cards(options.out, found.typical, np.inf if found.mostly_fluids else 0.0)
     for sentence in content["warnings"]:
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"written: {options.out}/fit.json, fit.png, fit.h5")

@@ -3,6 +3,7 @@ a sweep in closed form."""
 
 import argparse
 import contextlib
+import math
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -18,8 +19,9 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from fitting.fits.stress_stretch import LawFit
+    from fitting.fits.time_tests import TimeFit
+    from fitting.fits.together.residuals_of_tests import Together
     from fitting.fits.viscoelastic import Fit, Kind
-    from fitting.methods.estimate import Estimate
     from fitting.methods.generalised_maxwell import Maxwell, Spectrum
     from fitting.readers.frequency_sweep import Sweep
     from fitting.rigs.compression import Shares
@@ -101,13 +103,22 @@ def has_draws(kind: "Kind") -> bool:
     return False
 
 
-def write_cards(out: Path, model: "Maxwell", of_fit: "Estimate | None" = None) -> None:
-    """Write material cards, and print notes on all parts of the model that a simulation program cannot represent.
-    `of_fit`: the fitted Prony modes with their errors, if the errors are known."""
+def write_cards_of_fit(out: Path, fit: "Fit | TimeFit | Together") -> None:
+    """Write the material cards of a fit (`write_cards`). The equilibrium modulus may be zero if its 95 % interval
+    contains 0, also if its standard error is small."""
+    from fitting.fits.honesty.long_times import INTERVAL
     from fitting.methods.uncertainty import equilibrium_error
+
+    interval = (fit.details or {}).get(INTERVAL)
+    error = math.inf if interval and interval["low"] <= 0 else equilibrium_error(fit.uncertainty)
+    write_cards(out, fit.model, error)
+
+
+def write_cards(out: Path, model: "Maxwell", error: float) -> None:
+    """Write material cards, and print notes on all parts of the model that a simulation program cannot represent.
+    `error`: standard error [Pa] of the equilibrium modulus; infinite if this modulus may be zero."""
     from fitting.reports import material_cards
 
-    error = 0.0 if of_fit is None else equilibrium_error(of_fit)
     for sentence in material_cards.write(out / "cards", model, error):
         print(f"note: {sentence}", file=sys.stderr)
     print(f"written: {out}/cards")

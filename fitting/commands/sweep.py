@@ -187,7 +187,7 @@ def run(options: argparse.Namespace) -> int:
 
         print(posterior_report.table(posterior))
     if options.cards:
-        shared_options.write_cards(options.out, fits[-1].model, fits[-1].uncertainty)
+        shared_options.write_cards_of_fit(options.out, fits[-1])
     if options.report:
         from fitting.reports import one_page
 

@@ -36,7 +36,7 @@ def run(options: argparse.Namespace) -> int:
     together_report.write(options.out, found, relative, options.density)
     print(together_report.table(found, relative))
     if options.cards:
-        shared_options.write_cards(options.out, found.model, found.uncertainty)
+        shared_options.write_cards_of_fit(options.out, found)
     for sentence in found.warnings:
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"written: {options.out}/fit.json, fit.png")

@@ -33,6 +33,13 @@ class Samples(NamedTuple):
         """The kind of the common model of all samples."""
         return self.fits[0].kind
 
+    @property
+    def mostly_fluids(self) -> bool:
+        """Whether at least half of the samples may be fluids: the equilibrium modulus is at most two standard errors,
+        or the model of the sample has no equilibrium modulus."""
+        pairs = [values_of_sample(f).get("equilibrium_modulus", (0.0, np.inf)) for f in self.fits]
+        return 2 * sum(value <= 2 * error for value, error in pairs) >= len(pairs)
+
     def values(self, k: int) -> dict[str, tuple[float, float]]:
         """Return the value and the standard error of each parameter of sample k. The keys are the names in
         `populations`. A strength that is missing in the spectrum of this sample is 0."""
@@ -299,6 +306,15 @@ def _place(name: str) -> int:
     return int(name[name.index("[") + 1 : -1])
 
 
+def typical_values(fits: list[Fit], populations: dict[str, Population | None]) -> dict[str, float]:
+    """Return the parameters of a typical sample, for another model than Prony modes: the means of the populations. For
+    a parameter without a mean, the median of the samples is used. A parameter of a spectrum is 0 if its median is 0."""
+    kind, every = fits[0].kind, [values_of_sample(f) for f in fits]
+    middle = {n: float(np.median([row.get(n, (0.0,))[0] for row in every])) for n in populations}
+    zero = {n for n, m in middle.items() if kind.effective is not None and m <= 0}
+    return {n: 0.0 if n in zero else middle[n] if p is None else p.mean for n, p in populations.items()}
+
+
 def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str, Population | None]) -> Maxwell:
     """Return the Prony modes of a typical sample, whose parameters are the means of the populations. Modes without a
     mean are not included. For other parameters without a mean, the median of the samples is used.
@@ -307,7 +323,6 @@ def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str,
     ratios alone would give another equilibrium modulus, so they are multiplied by one factor. This is not done if a
     mode has no mean, or if only one sample determines the equilibrium modulus."""
     kind, every = fits[0].kind, [values_of_sample(f) for f in fits]
-    middle = {n: float(np.median([row.get(n, (0.0,))[0] for row in every])) for n in populations}
     mean = {name: p.mean for name, p in populations.items() if p is not None}
     if kind.values is None:
         if "shear_modulus" not in mean:
@@ -315,18 +330,19 @@ def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str,
         known = [k for k in range(len(populations)) if {f"ratios[{k}]", f"relaxation_times[{k}]"} <= set(mean)]
         ratios, times = (np.array([mean[f"{n}[{k}]"] for k in known]) for n in ("ratios", "relaxation_times"))
         rest = mean.get("equilibrium_modulus", 0.0) / mean["shear_modulus"]
-        factor = (1 - max(rest, 1e-9)) / max(ratios.sum(), 1e-300)
+        factor = max(0.0, 1 - rest) / max(ratios.sum(), 1e-300)
         value, error = np.array([row.get("equilibrium_modulus", (0.0, np.inf)) for row in every]).T
         decided = rest < 1 and (rest > 0 or not np.any(value > ABOVE_ZERO * error))
         ratios = ratios * (factor if decided and len(known) == fits[0].modes else min(1.0, factor))
         return Maxwell(mean["shear_modulus"], ratios, times)  # type: ignore[arg-type]
+    typical = typical_values(fits, populations)
     low, high = min(s.angular_frequency[0] for s in sweeps), max(s.angular_frequency[-1] for s in sweeps)
     if kind.effective is not None:
         grid = relaxation_spectrum.grid_of_times(1 / high, 1 / low, fits[0].details["spectrum"]["times_per_decade"])
         strengths = np.zeros(1 + len(grid))
         for name in populations:
             place = 0 if name == "equilibrium_modulus" else 1 + _place(name)
-            strengths[place] = mean.get(name, middle[name]) if middle[name] > 0 else 0.0
+            strengths[place] = typical[name]
 
         def smooth(omega):
             return np.split(generalised_maxwell.mode_columns(omega, grid) @ strengths, 2)
@@ -334,7 +350,7 @@ def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str,
         made = as_prony_modes.convert(smooth, low, high, bool(strengths[0] > 0))
         return as_prony_modes.modes(made, smooth(made.omega))
     (model,) = (m for m in springpots.FRACTIONAL if m.name == kind.name)
-    values = [mean.get(name, middle[name]) for name in model.names]
+    values = [typical[name] for name in model.names]
 
     def formula(omega):
         G = model.formula(1j * omega, *values)

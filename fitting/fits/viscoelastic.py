@@ -256,8 +256,8 @@ def root_of_noise_shown(found: Solution, sweep: Sweep) -> np.ndarray | None:
 
 def sizes_of_noise(fit: Fit, sweep: Sweep) -> np.ndarray | None:
     """Return the standard deviations (2n,) of the residuals of G' and G'' at n frequencies, if the residuals show that
-    the standard deviations differ (`sizes_shown`). Returns None if they may be equal, or if standard deviations are
-    given."""
+    the standard deviations differ (`sizes_shown`). Returns None if they may be equal, or if standard deviations that
+    describe the noise are given (`Sweep.noise_given`)."""
     J, r = np.asarray(fit.solution.jacobian), np.asarray(fit.solution.residuals)
     return None if fit.noise_root is None else sizes_shown(J, r, np.concatenate(sweep.deviations))
 

@@ -73,7 +73,10 @@ def figure(sweep: StrainSweep, fits: list[StrainFit]) -> "Figure":
         right.plot(percent, 100 * f.third, style, color=COLOURS[k % len(COLOURS)], lw=width, label=f.law.label)
     left.set(xscale="log", yscale="log", xlabel="strain at the rim [%]", ylabel="modulus of the first harmonic [Pa]")
     right.set(xscale="log", yscale="log", xlabel="strain at the rim [%]", ylabel="third harmonic over the first [%]")
-    right.set_ylim(bottom=1e-4)  # smaller values are roundoff, or below any instrument's resolution
+    # Values below the axis are roundoff, or below any instrument's resolution. A law without a third harmonic has only
+    # such values, so the upper end does not follow from the values alone.
+    largest = 100 * max(float(f.third.max()) for f in fits[:4])
+    right.set_ylim(1e-4, max(1e-3, 2 * largest))
     for axes in (left, right):
         axes.legend(fontsize=8, frameon=False)
         axes.grid(alpha=0.3)

@@ -26,7 +26,7 @@ _DISTINCT = 2.0
 
 def write(folder: Path, model: Maxwell, equilibrium_error: float = 0.0) -> list[str]:
     """Write all cards into `folder`. Return notes on every property that one of the programs cannot represent.
-    `equilibrium_error`: standard error [Pa] of the equilibrium modulus."""
+    `equilibrium_error`: standard error [Pa] of the equilibrium modulus; infinite if this modulus may be zero."""
     folder.mkdir(parents=True, exist_ok=True)
     told = []
     if len(model.ratios) > FEBIO_TERMS:

@@ -8,7 +8,7 @@ import numpy as np
 
 from fitting.fits.families import limits
 from fitting.fits.honesty import edges, total_error
-from fitting.fits.samples import Samples, outliers
+from fitting.fits.samples import Samples, outliers, typical_values
 from fitting.fits.viscoelastic import SHORT
 from fitting.methods import generalised_maxwell
 from fitting.methods.population import BELOW
@@ -39,16 +39,16 @@ def _json_content(found: Samples) -> Content:
     typical, errors = found.typical, np.concatenate([f.relative_errors(s) for f, s in _pairs(found)])
     own: Content = {}
     if found.kind.values is not None:
-        rows = _known_errors(found).items()
-        own = {"parameters": {n: {"value": p.mean, "standard_error": p.mean * p.mean_error} for n, p in rows}}
-    rest = float(typical.shear_modulus * (1 - np.sum(np.asarray(typical.ratios))))
+        known = {n: p.mean_error for n, p in _known_errors(found).items()}
+        rows = typical_values(found.fits, found.populations).items()
+        own = {"parameters": {n: {"value": v, "standard_error": v * known[n] if n in known else None} for n, v in rows}}
     return {
         "method": "closed-form",
         "model": found.kind.name,
         "converged": all(f.converged for f in found.fits),
         "modes": len(typical.ratios),
         "shear_modulus": float(typical.shear_modulus),
-        "equilibrium_modulus": max(0.0, rest),
+        "equilibrium_modulus": limits.equilibrium_of(typical),
         "ratios": np.asarray(typical.ratios).tolist(),
         "relaxation_times": np.asarray(typical.relaxation_times).tolist(),
         "standard_errors": _errors_of_typical(found),

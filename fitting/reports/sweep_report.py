@@ -202,12 +202,7 @@ def write(
         content.get("closed_form", content)["profile_intervals_95"] = profile
     if posterior is not None:
         content["posterior"] = posterior_report.summary(posterior)
-        content["warnings"] += posterior.warnings()
-        if alike_points.INDEPENDENT in main.details:
-            content["warnings"].append(
-                "the posterior assumes independent noise of all moduli, but neighbouring points are correlated. The "
-                "intervals of the posterior are too narrow: use the standard errors"
-            )
+        content["warnings"] += [*posterior.warnings(), *alike_points.posterior_cautions(main, sweep)]
         posterior_report.write_draws(out / "posterior.csv", posterior)
     content = numbers(content)
     write_whole(out / "fit.json", json.dumps(content, indent=2, allow_nan=False) + "\n")

@@ -67,13 +67,31 @@ def alike_of(fit: Fit) -> Alike | None:
 
 def with_weights_shown(fit: Fit, sweep: Sweep) -> Sweep:
     """Return the sweep with new weights, from the noise of G' and G'' that the residuals show. The sweep is unchanged
-    if all values have the same relative noise, or if standard deviations are given. It is also unchanged if
-    neighbouring residuals are correlated, because such residuals may be a misfit of the model."""
+    if all values have the same relative noise, or if standard deviations that describe the noise are given. It is also
+    unchanged if neighbouring residuals are correlated, because such residuals may be a misfit of the model."""
     sizes = None if INDEPENDENT in fit.details else sizes_of_noise(fit, sweep)
     if sizes is None:
         return sweep
     first, second = (d * s for d, s in zip(sweep.deviations, np.split(sizes, 2), strict=True))
     return sweep._replace(storage_sd=first, loss_sd=second, sd_estimated=True)
+
+
+def posterior_cautions(fit: Fit, sweep: Sweep) -> list[str]:
+    """Return warnings about the posterior of a fit: the noise of neighbouring frequencies is correlated, or the
+    posterior does not use the standard deviations of the file, although the fit uses them as weights."""
+    if INDEPENDENT in fit.details:
+        return [
+            "the posterior assumes independent noise of all moduli, but neighbouring points are correlated. The "
+            "intervals of the posterior are too narrow: use the standard errors"
+        ]
+    in_file = sweep.storage_sd is not None and not (sweep.sd_estimated or sweep.sd_before)
+    if not in_file or with_weights_shown(fit, sweep) is sweep:
+        return []
+    return [
+        "the posterior does not use the deviations in the file as weights. They are not noise, so the posterior uses "
+        "the noise of G' and of G'' that the residuals show. Its means and intervals may therefore differ from the "
+        "parameters and standard errors of the fit"
+    ]
 
 
 def not_below(estimate: Estimate, natural_of: Callable, u: np.ndarray, alike: Alike) -> Estimate:
