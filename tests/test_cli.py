@@ -23,6 +23,7 @@ from fitting.fits.families import springpots_in_time
 from liverjax.__main__ import main as liverjax_main
 from liverjax.commands import exit_codes
 from liverjax.commands.arguments import with_joined_numbers
+from liverjax.core.errors import InputError
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -470,3 +471,12 @@ def test_the_torsion_knows_the_height_when_points_are_left_out(tmp_path, method,
     none = dict.fromkeys(("table", "min_frequency", "max_frequency", "radius", "height"))
     options = argparse.Namespace(**none, density=1060.0, method=method)
     assert len(shared_options.usable_sweep(options, tmp_path / "s.csv").storage) == kept
+
+
+def test_the_data_of_a_described_test_are_not_replaced(tmp_path):
+    """Only the TOML file was an input."""
+    (tmp_path / "posterior.csv").write_text("time,displacement,force\n")
+    (tmp_path / "test.toml").write_text("test = 'sphere'\ndata = 'posterior.csv'\nlist = [['\\u0000'], 1]\n")
+    options = argparse.Namespace(out=tmp_path, samples=10, cards=False)
+    with pytest.raises(InputError, match=r"posterior\.csv would be replaced"):
+        shared_options.prepare_outputs(options, ("fit.json",), [tmp_path / "test.toml"])

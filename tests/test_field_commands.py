@@ -1,6 +1,8 @@
 """Maps from the command line."""
 
 import json
+import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from test_field import _SCENE, _scene, _write
 
 import liverjax as lj
 from fitting.__main__ import main
+from fitting.commands import field
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -55,3 +58,39 @@ def test_the_command_goes_on(tmp_path, capsys):
     again = json.loads((tmp_path / "out" / "field.json").read_text())
     name = "chi2_per_component"
     assert again["map"][name] <= 1.001 * first["map"][name]
+
+
+def test_unknown_effects_are_kept_for_the_file():
+    """A warning that the mesh error is unknown was printed, but it was not in field.json."""
+    sentence = "the effect of the mesh error on the fit is unknown: a step failed"
+    with pytest.warns(UserWarning) as told, field._unknown_effects() as unknown:
+        warnings.warn(sentence, stacklevel=1)
+        warnings.warn("another", stacklevel=1)
+    assert unknown == [sentence] and [str(one.message) for one in told] == [sentence, "another"]
+
+
+@pytest.mark.filterwarnings("ignore:the effect of the mesh error on the fit is unknown")
+def test_a_fit_whose_mesh_error_is_unknown_tells_it_in_its_file(tmp_path, monkeypatch):
+    sentence = "the effect of the mesh error on the fit is unknown: a step failed"
+
+    def fitted(problem, names, progress):
+        warnings.warn(sentence, stacklevel=1)
+        one = np.ones(1)
+        return SimpleNamespace(converged=True, names=names, values=one)
+
+    monkeypatch.setattr(field.scene_numbers, "fit_numbers", fitted)
+    monkeypatch.setattr(field.field_report, "table_of_numbers", lambda _: "")
+    monkeypatch.setattr(field.field_report, "misfit_sentence", lambda _: None)
+    monkeypatch.setattr(field.field_report, "of_numbers", lambda _: {"warnings": []})
+    scene = _scene(tmp_path, mu=1000.0)
+    np.savetxt(
+        tmp_path / "u.csv",
+        np.zeros((9, 4)) + np.arange(9)[:, None] * [1, 0, 0, 0],
+        delimiter=",",
+        header="node,ux,uy,uz",
+        comments="",
+    )
+    files = [str(tmp_path / "scene.toml"), str(tmp_path / "u.csv")]
+    assert scene.mesh.number_of_nodes > 9
+    assert main(["field", *files, "--noise", "5e-5", "--parameters", "law.mu", "--out", str(tmp_path / "out")]) == 0
+    assert json.loads((tmp_path / "out" / "field.json").read_text())["warnings"] == [sentence]

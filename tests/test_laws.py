@@ -314,6 +314,16 @@ def test_a_modulus_in_another_unit_than_pascal_is_refused():
             mu: float = lj.param("kPa", typical=0.77)
 
     @lj.struct
+    class Part:
+        stiffness: float = lj.param("kPa", default=0.77)
+
+    with pytest.raises(lj.InputError, match=r"Mixed\.stiffness has the unit 'kPa'"):  # a field of another base class
+
+        @lj.struct
+        class Mixed(Part, lj.Law):
+            pass
+
+    @lj.struct
     class Vessel:
         pressure: float = lj.param("mmHg", default=80.0)
 

@@ -369,3 +369,19 @@ def test_a_kill_while_parts_are_removed_leaves_no_parts_of_unknown_input(tmp_pat
     resumable_parts.write(resumable_parts.part(folder, 0), {"x": np.zeros(1)})
     with pytest.raises(lj.InputError, match=r"contains parts, but not the file run\.json with their input"):
         resumable_parts.same({"scene": "second"}, folder / "run.json")
+
+
+@pytest.mark.parametrize("kind", ["static", "harmonic"])
+def test_files_that_a_scene_names_are_not_replaced(kind, tmp_path, capsys):
+    """A mesh that an earlier run had written was replaced by the new results."""
+    name = "step_00001.vtu" if kind == "static" else "frequency_001.vtu"
+    (tmp_path / "vtu").mkdir()
+    lj.write_mesh(tmp_path / "vtu" / name, lj.shapes.box((0.01, 0.01, 0.01), (1, 1, 1)))
+    solve = "steps = 1" if kind == "static" else 'kind = "harmonic"\nfrequencies = [40.0]'
+    (tmp_path / "scene.toml").write_text(
+        f"[mesh]\nfile = 'vtu/{name}'\n[law]\nname = 'neo_hookean'\nmu = 770.0\nbulk = 7700.0\n"
+        "[body]\ndensity = 1000.0\n[[fixed]]\nwhere = {z_min = 0.01}\n[[displaced]]\nwhere = {z_max = 0.0}\n"
+        f"by = [0.0, 0.0, 1e-4]\n[solve]\n{solve}\n"
+    )
+    assert main(["simulate", str(tmp_path / "scene.toml"), "--vtu", "--out", str(tmp_path)]) == 2
+    assert f"{name} would be replaced by the results: give another --out" in capsys.readouterr().err

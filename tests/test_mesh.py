@@ -327,3 +327,12 @@ def test_a_gmsh_file_is_read_without_a_word(tmp_path, capsys):
     lj.read_mesh(tmp_path / "box.msh")
     printed = capsys.readouterr()
     assert printed.out == printed.err == ""
+
+
+def test_nodes_just_beyond_a_bound_are_told():
+    """A bound of six digits missed all nodes at 1/30 m without a word."""
+    mesh = lj.shapes.box((0.1, 0.1, 0.1), (3, 3, 3))
+    with pytest.warns(UserWarning, match=r"does not select 16 nodes that lie up to 3e-08 m beyond a bound"):
+        nodes = lj.boundary.select(mesh, {"x_max": 0.0333333})
+    assert len(nodes) == 16  # the contract stays exact
+    assert len(lj.boundary.select(mesh, {"x_max": 0.0334})) == 32

@@ -8,6 +8,7 @@ import pytest
 import liverjax as lj
 from liverjax.core.struct import replace
 from liverjax.physics.porosity import Inlet
+from liverjax.scenes.by_element import by_element
 from liverjax.scenes.checks.numbers import check_bounds
 from liverjax.scenes.checks.regions import check_region_porosity
 from liverjax.scenes.scene_file import scene_from
@@ -174,3 +175,18 @@ def test_overlapping_regions_are_checked_together():
         check(2e4, 1e6)
     both = (*everywhere(mesh, {"bulk": 2e4}), *everywhere(mesh, {"limit_bulk": 1e6}))
     check_bounds(column(region=both))
+
+
+@pytest.mark.parametrize("points", [1, 4])
+def test_a_region_changes_a_scene_with_values_at_integration_points(points):
+    """by_element failed with an error of NumPy, and limit_bulk was not compared with bulk."""
+    mesh = column(2).mesh
+    numbers = jnp.full((points, mesh.number_of_elements), 1600.0)
+    region = (lj.Region(elements=upper(mesh), porosity={"bulk": 4000.0}),)
+    scene = column(2, LIVER | {"bulk": numbers}, region)
+    check_bounds(scene)
+    found = np.asarray(by_element(scene).porosity.bulk)
+    assert found.shape == numbers.shape and np.all(found[:, upper(mesh)] == 4000) and found.min() == 1600
+    region = (lj.Region(elements=upper(mesh), porosity={"bulk": 6000.0}),)
+    with pytest.raises(lj.InputError, match=r"region\.0: .*must be above bulk = 6000"):
+        check_bounds(replace(scene, region=region))

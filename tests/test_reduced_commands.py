@@ -159,3 +159,19 @@ def test_an_empty_name_is_no_reduced_model(tmp_path):
     """The folder of the scene was put before the empty name, and was then taken for the model."""
     (tmp_path / "scene.toml").write_text(SCENE + 'reduced = ""\n')
     assert lj.load_scene(tmp_path / "scene.toml").solve.reduced == ""
+
+
+def test_a_model_on_another_drive_has_its_whole_path(monkeypatch, tmp_path, capsys):
+    """On Windows, the last line of the command was a traceback."""
+
+    def refused(*_):
+        raise ValueError("path is on mount 'D:', start on mount 'C:'")
+
+    monkeypatch.setattr(reduce.os.path, "relpath", refused)
+    model = SimpleNamespace(number_of_modes=1, points=[0])
+    monkeypatch.setattr(reduction, "make", lambda *_: model)
+    monkeypatch.setattr(reduction, "learnt", lambda _: "no correction")
+    options = argparse.Namespace(scene=tmp_path / "a.toml", rows=None, out=tmp_path / "m.h5", tolerance=1, modes=1)
+    options.runs = None
+    assert reduce.run(options) == 0
+    assert f'reduced = "{(tmp_path / "m.h5").resolve().as_posix()}"' in capsys.readouterr().out

@@ -289,3 +289,10 @@ def test_one_component_is_not_enough_for_forces(tmp_path, capsys):
     np.savez(tmp_path / "one.npz", displacement=field.displacement[..., :1], spacing=H, frequencies=HERTZ)
     assert command.main(["waves", str(tmp_path / "one.npz"), "--out", str(tmp_path)]) == 2
     assert "three components" in capsys.readouterr().err
+
+
+def test_a_sweep_with_the_data_is_not_replaced(tmp_path, capsys):
+    """The names of the sweeps that the command writes were not compared with its inputs."""
+    data = written(tmp_path, ".csv", plane_waves((5, 5, 5))).rename(tmp_path / "sweep_whole.csv")
+    assert command.main(["waves", str(data), "--density", "1000", "--no-map", "--out", str(tmp_path)]) == 2
+    assert "sweep_whole.csv would be replaced by the results" in capsys.readouterr().err

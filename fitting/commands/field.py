@@ -3,6 +3,8 @@
 import argparse
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +17,7 @@ from fitting.readers.displacements import read_displacements
 from fitting.reports import field_report
 from liverjax.core import status
 from liverjax.core.errors import InputError
-from liverjax.core.files import writable
+from liverjax.core.files import named_files, writable
 from liverjax.core.struct import Content
 from liverjax.scenes.scene import numbers_at
 from liverjax.scenes.scene_file import load_scene
@@ -102,13 +104,15 @@ def _fit_few_numbers(options: argparse.Namespace, problem: Problem) -> int:
         numbers_at(problem.scenes[0], name)
         if names.count(name) > 1:
             raise InputError(f"--parameters names {name} twice: remove one")
-    writable(options.out, ("field.json",), inputs=options.files)
+    writable(options.out, ("field.json",), inputs=_inputs(options))
     bar, told = cost_bar("iterations")
-    with bar:
+    with bar, _unknown_effects() as unknown:
         found = scene_numbers.fit_numbers(problem, names, progress=told)
     print(field_report.table_of_numbers(found))
     _warn(field_report.misfit_sentence(found))
-    field_report.write(options.out, problem.scenes[0].mesh, _files(options) | field_report.of_numbers(found), None)
+    content = field_report.of_numbers(found)
+    content["warnings"] += unknown
+    field_report.write(options.out, problem.scenes[0].mesh, _files(options) | content, None)
     print(f"written: {options.out}/field.json")
     return 0 if found.converged else 1
 
@@ -124,7 +128,7 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
             file=sys.stderr,
         )
     files = ("field.json", "field.vtu", "field.h5", "field.png", "progress.h5")
-    writable(options.out, files, inputs=options.files)
+    writable(options.out, files, inputs=_inputs(options))
     kept = sum(gradients.memory(scene) for scene in problem.scenes) / 1e6
     print(f"gradients need about {kept:.0f} MB of memory", file=sys.stderr)
     length = options.length or float(np.ptp(np.asarray(mesh.points), axis=0).max()) / 10
@@ -133,7 +137,8 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     how = field.MapOptions(
         max_iterations=options.iterations or _ITERATIONS, file=file, resume=options.resume, progress=told
     )
-    problem, beside = scene_numbers.with_discretisation_as_noise(problem)
+    with _unknown_effects() as unknown:
+        problem, beside = scene_numbers.with_discretisation_as_noise(problem)
     _tell_sizes(problem, beside)
     if not options.resume:
         file.unlink(missing_ok=True)  # this file is from an earlier run
@@ -145,6 +150,7 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     kinds = dict.fromkeys(("mesh", *beside[0]))
     sizes = {f"{kind}_error_over_noise": [each.get(kind, np.nan) for each in beside] for kind in kinds}
     content = _files(options) | {"map": field_report.of_field(mesh, found) | sizes}
+    content["map"]["warnings"] += unknown
     for sentence in field_report.map_sentences(mesh, found):
         _warn(sentence)
     if options.sphere:
@@ -163,14 +169,29 @@ def _sphere(problem: Problem, found: field.Field, with_mesh: bool) -> tuple[Cont
     except InputError as e:  # the map is complete, so it is written without a sphere
         _warn(str(e))
         return {"warnings": [str(e)]}, False
-    sphere = inclusion.estimate(problem, found.name, start)
+    with _unknown_effects() as unknown:
+        sphere = inclusion.estimate(problem, found.name, start)
     print(field_report.table_of_numbers(sphere))
     small = inclusion.size_sentence(problem.scenes[0].mesh, sphere)
     _warn(field_report.misfit_sentence(sphere, with_mesh))
     _warn(small)
     content = field_report.of_numbers(sphere, with_mesh)
-    content["warnings"] += [small] if small else []
+    content["warnings"] += [*unknown, *([small] if small else [])]
     return content, sphere.converged
+
+
+@contextmanager
+def _unknown_effects() -> Iterator[list[str]]:
+    """Yield a list. At the end of the context, it contains the warnings that an effect of the mesh or of the time steps
+    is unknown. All warnings are given at the end of the context."""
+    found: list[str] = []
+    with warnings.catch_warnings(record=True) as given:
+        warnings.simplefilter("always")
+        yield found
+    for one in given:
+        warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+    sentences = dict.fromkeys(str(one.message) for one in given)
+    found += [sentence for sentence in sentences if sentence.startswith("the effect of the ")]
 
 
 def _tell_sizes(problem: Problem, beside: list[dict[str, float]]) -> None:
@@ -192,6 +213,11 @@ def _tell_sizes(problem: Problem, beside: list[dict[str, float]]) -> None:
 def _warn(sentence: str | None) -> None:
     if sentence is not None:
         print(f"warning: {sentence}", file=sys.stderr)
+
+
+def _inputs(options: argparse.Namespace) -> list[Path]:
+    """Return the scenes, the files that they name, and the displacements."""
+    return [*options.files, *(named for scene in options.files[::2] for named in named_files(scene))]
 
 
 def _files(options: argparse.Namespace) -> dict:

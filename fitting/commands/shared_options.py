@@ -13,7 +13,7 @@ import numpy as np
 
 from fitting.commands.progress import named_bar
 from liverjax.core.errors import InputError
-from liverjax.core.files import writable
+from liverjax.core.files import named_files, writable
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -126,10 +126,13 @@ def write_cards(out: Path, model: "Maxwell", error: float) -> None:
 
 def prepare_outputs(options: argparse.Namespace, files: tuple[str, ...], inputs: Iterable[Path]) -> None:
     """Make the folder of the results, and check that all result files can be written: `files`, and the files that
-    --samples, --report and --cards request. No result may replace one of the `inputs`."""
+    --samples, --report and --cards request. No result may replace one of the `inputs`, or a file that a TOML file among
+    them names."""
+    read = list(inputs)
+    read += [named for path in read if path.suffix.lower() == ".toml" for named in named_files(path)]
     asked = {"posterior.csv": options.samples, "report.pdf": getattr(options, "report", False)}
     names = (*files, *(name for name, wanted in asked.items() if wanted))
-    writable(options.out, names, ("cards",) if options.cards else (), inputs)
+    writable(options.out, names, ("cards",) if options.cards else (), read)
 
 
 def usable_sweep(options: argparse.Namespace, path: Path, error_is_fitted: bool = False) -> "Sweep":

@@ -96,7 +96,8 @@ def run(options: argparse.Namespace) -> int:
         options.data, options.frequencies, options.mask, options.labels, options.unit, options.spacing
     )
     field = wave_field.with_noise(field, options.noise)
-    writable(options.out, FILES, inputs=[path for path in (options.data, options.mask, options.labels) if path])
+    inputs = [path for path in (options.data, options.mask, options.labels) if path]
+    writable(options.out, (*FILES, "sweep_*.csv"), inputs=inputs)
     coarse, body = _coarse_and_body(options, field)
     if not options.no_map:
         _check_length_of_map(options.length, body)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from liverjax.core.errors import InputError
-from liverjax.core.files import writable
+from liverjax.core.files import named_files, writable
 
 if TYPE_CHECKING:
     from liverjax.jobs.waves import Waves
@@ -22,7 +22,8 @@ def run(options: argparse.Namespace, scene: "Scene", text: str) -> int:
 
     target = options.out / "result.h5"
     _refuse_options(options, target)
-    writable(options.out, (target.name,), ("vtu",) if options.vtu else ())
+    files, folders = ((target.name, "vtu/frequency_*.vtu"), ("vtu",)) if options.vtu else ((target.name,), ())
+    writable(options.out, files, folders, [options.scene, *named_files(options.scene)])
     ran = waves.solved_waves(scene, options.about, options.mesh_error)
     waves.write_waves(
         target, scene, ran, {"scene": text, "run_time_s": ran.seconds, "warnings": ran.cautions, "versions": versions()}

@@ -3,6 +3,7 @@ table."""
 
 import argparse
 import os
+from contextlib import suppress
 from pathlib import Path
 
 
@@ -47,6 +48,8 @@ def run(options: argparse.Namespace) -> int:
         f"{model.number_of_modes} modes, {len(model.points)} points, {reduction.learnt(model)}\nwritten: {options.out}"
     )
     # Paths in a scene file are relative to the folder of the scene file.
-    path = os.path.relpath(options.out.resolve(), options.scene.parent.resolve())
+    path = str(options.out.resolve())
+    with suppress(ValueError):  # on Windows, there is no relative path between two drives
+        path = os.path.relpath(path, options.scene.parent.resolve())
     print(f'to use this model, write reduced = "{Path(path).as_posix()}" in [solve]')
     return 0

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from liverjax.commands import harmonic
 from liverjax.commands.arguments import add_out
 from liverjax.core.errors import InputError
-from liverjax.core.files import writable
+from liverjax.core.files import named_files, writable
 
 if TYPE_CHECKING:
     from liverjax.jobs.long_run import Ran
@@ -67,7 +67,7 @@ def run(options: argparse.Namespace) -> int:
         return harmonic.run(options, scene, text)
     _check_before_steps(options, scene)
     target = options.out / "result.h5"
-    _check_outputs(options, target, scene, reactions)
+    _check_outputs(options, target, reactions)
     long_run.refuse_unfinished(target, options.resume, text)
     given = scene.points_are
     if given == "loaded":
@@ -140,12 +140,11 @@ def _check_before_steps(options: argparse.Namespace, scene: "Scene") -> None:
         refuse(scene)
 
 
-def _check_outputs(options: argparse.Namespace, target: Path, scene: "Scene", reactions: bool) -> None:
+def _check_outputs(options: argparse.Namespace, target: Path, reactions: bool) -> None:
     """Raise `InputError` if one of the results cannot be written."""
-    asked = {target.name: True, "reactions.csv": reactions, "result.png": options.png}
+    asked = {target.name: True, "reactions.csv": reactions, "result.png": options.png, "vtu/step_*.vtu": options.vtu}
     files = tuple(name for name, wanted in asked.items() if wanted)
-    model = (Path(scene.solve.reduced),) if scene.solve.reduced else ()
-    writable(options.out, files, ("vtu",) if options.vtu else (), model)
+    writable(options.out, files, ("vtu",) if options.vtu else (), [options.scene, *named_files(options.scene)])
 
 
 def _reduced(scene: "Scene") -> tuple["Ran | None", "Scene"]:

@@ -7,6 +7,7 @@ import glob
 import hashlib
 import tempfile
 import time
+import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -22,7 +23,7 @@ def writable(out: Path, files: tuple[str, ...], folders: tuple[str, ...] = (), i
 
     Args:
         out: folder of the results.
-        files: names of the files that will be written.
+        files: names of the files that will be written. `*` stands for any characters.
         folders: names of the folders that will be made in `out`.
         inputs: files that are read, and must not be replaced by `files`.
 
@@ -38,7 +39,7 @@ def writable(out: Path, files: tuple[str, ...], folders: tuple[str, ...] = (), i
     for name in folders:
         if (out / name).exists() and not (out / name).is_dir():
             raise InputError(f"--out {out} contains a file {name}, but a folder {name} is needed: name another folder")
-    written = {(out / name).resolve() for name in files}
+    written = {file.resolve() for name in files for file in (out / name, *out.glob(name))}
     for path in inputs:
         if path.resolve() in written:
             raise InputError(f"{path} would be replaced by the results: give another --out")
@@ -48,6 +49,20 @@ def writable(out: Path, files: tuple[str, ...], folders: tuple[str, ...] = (), i
             pass
     except OSError as error:
         raise InputError(f"--out {out} cannot be used ({error.strerror}): name a folder that can be written") from None
+
+
+def named_files(toml: Path) -> list[Path]:
+    """Return the files that a TOML file names, for example a mesh. Its paths are relative to its folder."""
+    found: list[Path] = []
+    values: list[object] = [tomllib.loads(toml.read_text(encoding="utf-8-sig"))]
+    while values:
+        value = values.pop()
+        if isinstance(value, str):
+            with suppress(OSError, ValueError):  # a text that cannot be a path
+                found += [toml.parent / value] if (toml.parent / value).is_file() else []
+        elif isinstance(value, dict | list):
+            values += value.values() if isinstance(value, dict) else value
+    return found
 
 
 #: Age [s] above which a temporary file is assumed to be from a killed process.

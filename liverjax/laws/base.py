@@ -43,9 +43,13 @@ class Law(Energies):
     """A hyperelastic law: energy per reference volume [Pa]. The module's docstring lists the methods to override."""
 
     def __init_subclass__(cls) -> None:
-        """Raise `InputError` if a parameter of a new law has a unit of pressure other than Pa."""
+        """Raise `InputError` if a parameter of a new law, or of one of its base classes, has a unit of pressure other
+        than Pa."""
         super().__init_subclass__()
-        for name, field in vars(cls).items():
+        fields: dict[str, object] = {}
+        for base in reversed(cls.__mro__):
+            fields |= vars(base) | vars(base).get("__dataclass_fields__", {})
+        for name, field in fields.items():
             unit = field.metadata.get("unit") if isinstance(field, dataclasses.Field) else None
             if unit in _NOT_PASCAL:
                 raise InputError(f"{cls.__name__}.{name} has the unit {unit!r}: declare the unit Pa, with values in Pa")

@@ -14,6 +14,8 @@ from liverjax.mesh.tetrahedra import FACES, TetMesh, tolerance_of_bounds
 AXES = "xyz"
 #: A bound may be in millimetres if it is larger than this multiple of the largest coordinate of the mesh.
 FAR_OUTSIDE = 10.0
+#: A warning is given if nodes lie beyond a bound by less than this fraction of the mesh's size.
+_BARELY = 1e-6
 
 
 def select(
@@ -48,7 +50,8 @@ def select(
         raise InputError(f"{name} = {where!r} is not a table of bounds: write where = {{z_max = 0.0}}")
     points = np.asarray(mesh.points)
     tolerance = tolerance_of_bounds(mesh)
-    inside = np.ones(len(points), dtype=bool)
+    near = max(tolerance, _BARELY * float(np.linalg.norm(np.ptp(points, axis=0))))
+    inside, beyond = np.ones(len(points), dtype=bool), np.full(len(points), -np.inf)
     known = [f"{a}_{end}" for a in AXES for end in ("min", "max")]
     for key, bound in where.items():
         if key not in known:
@@ -58,10 +61,18 @@ def select(
         x = points[:, AXES.index(key[0])]
         _warn_of_millimetres(x, key, bound, name)
         inside &= x >= bound - tolerance if key.endswith("min") else x <= bound + tolerance
+        beyond = np.maximum(beyond, bound - x if key.endswith("min") else x - bound)
     if not inside.any():
         low, high = points.min(axis=0), points.max(axis=0)
         box = ", ".join(f"{a} {lo:.4g} to {hi:.4g}" for a, lo, hi in zip(AXES, low, high, strict=True))
         raise InputError(f"{name} = {where} selects no node: choose bounds within the mesh, which spans {box} m")
+    missed = beyond[~inside & (beyond <= near)]
+    if missed.size:
+        warnings.warn(
+            f"{name} = {where} does not select {missed.size} nodes that lie up to {missed.max():.1g} m beyond a bound: "
+            "give the bound with more digits, or a little wider",
+            stacklevel=2,
+        )
     return np.flatnonzero(inside)
 
 

@@ -105,14 +105,15 @@ def _per_element(values: Numbers) -> jax.Array:
 def porosity_of_elements(porosity: Porosity, regions: tuple[Region, ...], mesh: TetMesh) -> Porosity:
     """Return the porosity of the body. A parameter that a region changes has one value per element.
 
-    The values of such a parameter have the shape (E,), or (1, E) if the elements have several integration points.
+    The values of such a parameter have the shape (E,). If the elements have Q integration points, the shape is (1, E),
+    or (Q, E) if the scene has a value for each point.
     """
     found: Content = {}
     for region in regions:
         for name, value in (region.porosity or {}).items():
             before = jnp.asarray(found.get(name, getattr(porosity, name)), float)
-            base = jnp.broadcast_to(before, (mesh.number_of_elements,))
-            found[name] = base.at[region.elements].set(value)
+            base = jnp.broadcast_to(before, (*before.shape[:-1], mesh.number_of_elements))
+            found[name] = base.at[..., region.elements].set(value)
     return sponge_at_points(replace(porosity, **found), mesh)
 
 

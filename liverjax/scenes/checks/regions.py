@@ -188,16 +188,16 @@ def _check_limits(scene: Scene) -> None:
     places = {k: scene.region[k].elements for k in changed}
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((values, changed, places))):
         return
-    if any(np.shape(value) not in ((), (1,), (n,)) for value in values.values()):
+    if any(np.shape(value)[-1:] not in ((), (1,), (n,)) for value in values.values()):
         return  # other shapes are not compared here
     for key in keys:
-        numbers = np.broadcast_to(np.asarray(values[key], float), (n,)).copy()
+        numbers = np.broadcast_to(np.asarray(values[key], float), (*np.shape(values[key])[:-1], n)).copy()
         for k, own in changed.items():
             elements = np.asarray(places[k])
             if elements.dtype.kind not in "iu" or np.any((elements < 0) | (elements >= n)):
                 return
             if key in own:
-                numbers[elements] = own[key]
+                numbers[..., elements] = own[key]
         values[key] = numbers
     try:
         check_limit(replace(porosity, **values))
