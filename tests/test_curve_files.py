@@ -10,6 +10,7 @@ from test_curves import KNOWN
 from fitting.__main__ import main
 from fitting.fits import stress_stretch
 from fitting.readers import curves
+from fitting.readers.tables import text_tables
 from liverjax.core.errors import InputError
 from liverjax.laws import homogeneous
 
@@ -369,3 +370,16 @@ def test_copies_of_all_rows_count_once(tmp_path):
         assert np.array_equal(read[0].stress, found[0][0][0].stress)
         assert len(notes) == 1 and "rows are ignored, because they are copies of other rows" in notes[0]
     assert len(found[3][0][1].stress) == 5 and "c.csv: 5 rows are" in found[3][1][0]
+
+
+def test_a_comment_may_follow_the_numbers_of_a_row(tmp_path):
+    """A row with "0.21 # slipped" was refused. Commas and numbers in the comment do not matter."""
+    rows = [f"3 #2,uniaxial,{1 + 0.05 * k:.2f},{0.2 * k:.1f}" for k in range(1, 9)]
+    rows[0] += " # slipped, 3 times, 4"
+    rows[1] += ",# slipped, 3 times"
+    rows[2] += ",a remark"
+    (tmp_path / "c.csv").write_text("\n".join(["sample,test,stretch,nominal_stress_kPa", *rows]) + "\n")
+    ((found,), _) = curves.read_curves([tmp_path / "c.csv"])
+    assert np.allclose(found.stress, 200 * np.arange(1, 9)) and np.allclose(found.driven, 1 + 0.05 * np.arange(1, 9))
+    cells = text_tables.without_comments(["3 #2", "1e-3# x", "5 # y", "7"], [False, True, True])
+    assert cells == ["3 #2", "1e-3", "5"]

@@ -452,3 +452,10 @@ def test_the_total_error_stands_beside_a_model_s_own_numbers(tmp_path):
     content = json.loads((tmp_path / "fit.json").read_text())
     own = content["parameters"]["equilibrium_modulus"]
     assert own["total_error"] == content["total_errors"]["equilibrium_modulus"] >= own["standard_error"]
+    # The strengths had no total error.
+    strengths = [p for name, p in content["parameters"].items() if name.startswith("strengths[")]
+    assert [p["total_error"] for p in strengths] == content["total_errors"]["strengths"]
+    relative = [
+        s / p["value"] for s, p in zip(content["error_shares"]["geometry"]["strengths"], strengths, strict=True)
+    ]
+    assert len(relative) > 3 and np.allclose(relative, relative[0]) and relative[0] > 0.01

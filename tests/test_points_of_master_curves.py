@@ -1,9 +1,9 @@
-"""The points of a master curve: which of them are used, and which weights they have."""
+"""The points of a master curve: which of them are used, and which weights they have. Notes on missing laws."""
 
 import numpy as np
 import pytest
 
-from fitting.master import temperature_sweeps
+from fitting.master import master_curve, master_report, shifts, temperature_laws, temperature_sweeps
 from fitting.master.temperature_sweeps import AtTemperatures
 from fitting.methods import generalised_maxwell
 from fitting.methods.generalised_maxwell import Maxwell
@@ -136,3 +136,15 @@ def test_joined_sweeps_name_the_first_file_and_count_the_others():
     assert pair.source == "x, y/0.csv and 1 more file"
     every = temperature_sweeps.joined([pair, three[2], three[2]])
     assert every.source == "x, y/0.csv and 2 more files" and every.files == tuple(s.source for s in three)
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_a_missing_law_is_told(count):
+    """Nothing said why the table had no line for WLF. At four temperatures, these factors curve to the other side."""
+    T = 273.15 + 10.0 * np.arange(count)
+    zero, factors = np.zeros(count), -(np.arange(count) ** 2.0)
+    found = shifts.Shifts(T, 0, factors, zero, zero, zero, zero, zero + 4, np.zeros((count, count)), 1.0)
+    laws = temperature_laws.temperature_laws_of(found)
+    table = master_report.shift_table(master_curve.MasterCurve(exact(np.array([1.0, 2.0])), [], found, laws))
+    told = ("no law is fitted to 2 temperatures", "WLF needs four temperatures", "WLF is left out")[count - 2]
+    assert len(laws) == (count > 2) and table.count("note: ") == 1 and f"note: {told}" in table

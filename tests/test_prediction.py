@@ -6,7 +6,7 @@ from conftest import SHARED
 
 from fitting.__main__ import main
 from fitting.fits import viscoelastic
-from fitting.master import master_curve
+from fitting.master import master_curve, temperature_sweeps
 from fitting.methods import generalised_maxwell, time_response
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.frequency_sweep import Sweep
@@ -81,6 +81,24 @@ def test_a_temperature_in_the_name_of_the_table_counts(tmp_path):
     assert "shift factor 10" in told[0] and "its temperature is not known" in told[1]
     # The mean of these temperatures is 40 °C. The note said: measured at 40 °C, but predicted at 40 °C.
     assert "it has several temperatures (10 to 70 °C)" in told[2] and len(told) == 3
+
+
+def test_a_drift_is_not_several_temperatures_and_an_ignored_sweep_is_told(tmp_path):
+    """A drift of 3 K was told to be several temperatures, and a name with two temperatures too. For an ignored
+    temperature, the sentence said that no sweep at this temperature was given."""
+    shift = {"reference_temperature_C": 40.0, "temperatures_C": [20.0, 40.0], "log10_a": [1.0, 0.0]}
+    shift |= {"log10_b": [0.0, 0.0], "ignored_temperatures_C": [30.0]}
+    one = sweep(0.0, 0)._replace(source="a.csv")
+    drift, known = (one._replace(raw={"temperature": 273.15 + T}) for T in (np.linspace(20, 23, 25), np.full(25, 30.2)))
+    stored = one._replace(table="25 °C batch, stored 4 °C")
+    _, told = master_curve.at_reference([drift, stored, known], shift)
+    assert "its temperature changes by 3 K (20 to 23 °C)" in told[0] and "constant temperature" in told[0]
+    assert "its temperature is not known" in told[1]
+    assert "because the sweep at its temperature is ignored" in told[2]
+    few = "".join(f"{f},{1 + f},{f},{T}\n" for T, n in ((10, 4), (20, 4), (30, 2)) for f in range(1, n + 1))
+    (tmp_path / "m.csv").write_text(f"frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,temperature_C\n{few}")
+    data = temperature_sweeps.read_temperatures([tmp_path / "m.csv"])
+    assert np.allclose(master_curve.master_curve(data, None).ignored, 303.15)
 
 
 def test_errors_of_a_sweep_with_deviations_are_relative_to_its_moduli():

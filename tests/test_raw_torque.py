@@ -50,6 +50,9 @@ def test_the_inertia_is_found_and_the_points_below_it_left_out(sample, phase, tm
     assert 0 < lost.sum() < 10 and np.allclose(kept.angular_frequency, OMEGA[~lost])
     assert np.allclose(kept.grey[:, 0], OMEGA[lost]) and np.allclose(kept.grey[:, 1], G.real[lost])
     assert f"{lost.sum()} of 20 points" in kept.notes[1]
+    # Points that were ignored before were lost.
+    again = without_inertia(s._replace(grey=np.ones((1, 3))), *size)
+    assert np.array_equal(again.grey, np.vstack([np.ones((1, 3)), kept.grey]))
 
 
 @pytest.mark.parametrize("lines", [(4,), (6, 9, 22)])

@@ -16,7 +16,7 @@ from fitting.methods import time_response, uncertainty
 from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers import changes_of_load
-from fitting.readers.time_tests import TimeTest, kind_of, read_time_test
+from fitting.readers.time_tests import Sample, TimeTest, kind_of, read_test_of_any_kind, read_time_test
 from liverjax import InputError
 
 pytestmark = pytest.mark.quick_to_compile
@@ -93,6 +93,20 @@ def test_the_changes_of_a_load_are_searched_once(monkeypatch):
     first = test._replace(notes=("another",)).since_change
     assert np.array_equal(first, test.since_change) and test.resolved[0] == pytest.approx(0.01) and len(searches) == 1
     assert not np.array_equal(test._replace(driven=np.sin(2 * time)).since_change, first) and len(searches) == 2
+
+
+def test_an_imposed_column_that_hardly_shows_is_told(tmp_path):
+    """Two sines without noise were read as one kind of test without a note."""
+    time = np.linspace(0, 400, 4001)
+    hold, sine = np.minimum(time, 1), np.sin(time)
+    for load, told in ((sine, 1), (hold, 0)):
+        answer = np.asarray(time_response.stress_response(SOLID, time, load))
+        columns = np.column_stack([time, load, answer])
+        np.savetxt(tmp_path / "t.csv", columns, delimiter=",", header="time_s,strain_1,stress_Pa", comments="")
+        test = read_test_of_any_kind(tmp_path / "t.csv", Sample())
+        notes = [note for note in test.notes if "is taken as imposed, but the rows hardly show" in note]
+        assert len(notes) == told
+        assert not told or f"python -m fitting {'creep' if test.kind == 'relaxation' else 'relaxation'}" in notes[0]
 
 
 @pytest.mark.parametrize("kind", ["relaxation", "creep"])

@@ -113,4 +113,4 @@ def read_any(options: argparse.Namespace, path: Path, whole: bool = False) -> "M
         sweep = rheometer.without_inertia(sweep, options.radius, options.height)
         named = options.max_frequency and not whole
         return sweep if named else shared_options.without_instrument_or_sample(options, sweep)
-    return time_tests.read_time_test(path, time_tests.kind_of(path), time_tests.Sample(options.radius, options.height))
+    return time_tests.read_test_of_any_kind(path, time_tests.Sample(options.radius, options.height))

@@ -9,8 +9,8 @@ import scipy.special
 from fitting.master import shifts, temperature_laws
 from fitting.master.shifts import Shifts
 from fitting.master.temperature_laws import TemperatureLaw
-from fitting.master.temperature_sweeps import SAME, AtTemperatures, joined, temperatures_in
-from fitting.readers.frequency_sweep import Sweep, merged, scatter
+from fitting.master.temperature_sweeps import OFF_NAME, SAME, AtTemperatures, joined, temperatures_in
+from fitting.readers.frequency_sweep import Sweep, merged, mostly_repeated, scatter
 from fitting.readers.rheometer import WARMER
 from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
@@ -42,6 +42,7 @@ class MasterCurve(NamedTuple):
     parts: list[Sweep]  # the shifted sweeps, in the order of the temperatures
     shifts: Shifts
     laws: list[TemperatureLaw]  # fitted laws, best fit first
+    ignored: np.ndarray = np.zeros(0)  # temperatures [K] whose sweeps are ignored
 
 
 def master_curve(data: AtTemperatures, reference: float | None, vertical: bool = False) -> MasterCurve:
@@ -84,7 +85,7 @@ def master_curve(data: AtTemperatures, reference: float | None, vertical: bool =
             "--vertical finds no factors of the moduli, because the file gives the factors of the frequencies: remove "
             "the column shift_factor to find both kinds of factors"
         )
-    return MasterCurve(whole._replace(notes=tuple(notes), raw=None), parts, found, laws)
+    return MasterCurve(whole._replace(notes=tuple(notes), raw=None), parts, found, laws, data.ignored)
 
 
 def _shifted_sweep(sweep: Sweep, log_a: float, log_b: float) -> Sweep:
@@ -218,7 +219,13 @@ def _test_at_reference(test: "Measured", shift: Content) -> "tuple[Measured, str
             f"{test.source}: its temperature is not known, so it is predicted at {reference:.4g} °C without a shift: "
             f"{add}check that it was measured at this temperature"
         )
-    if np.ptp(heat) > WARMER:
+    apart = float(np.ptp(heat))
+    if WARMER < apart <= OFF_NAME and not mostly_repeated(test.angular_frequency):
+        return test, (
+            f"{test.source}: its temperature changes by {apart:.2g} K ({heat.min():.4g} to {heat.max():.4g} °C), so it "
+            f"is predicted at {reference:.4g} °C without a shift: measure it at a constant temperature"
+        )
+    if apart > WARMER:
         return test, (
             f"{test.source}: it has several temperatures ({heat.min():.4g} to {heat.max():.4g} °C), so it is predicted "
             f"at {reference:.4g} °C without a shift: give one file for each temperature"
@@ -233,20 +240,24 @@ def _test_at_reference(test: "Measured", shift: Content) -> "tuple[Measured, str
         log_a, log_b = (shift[name][k] for name in ("log10_a", "log10_b"))
         shifted = _shifted_sweep(test, log_a, log_b)
         return shifted, f"{at}; its frequencies are multiplied by the shift factor {10.0**log_a:.4g}"
+    dropped = any(abs(own - T) < SAME for own in shift.get("ignored_temperatures_C", []))
+    why = "the sweep at its temperature is ignored" if dropped else "no sweep at its temperature is fitted"
+    remedy = "include that sweep (a note says why it is ignored)" if dropped else "give such a sweep"
     return test, (
-        f"{at}, but predicted at {reference:.4g} °C, because no sweep at its temperature is fitted: choose a reference "
-        "temperature near to it, or give such a sweep"
+        f"{at}, but predicted at {reference:.4g} °C, because {why}: choose a reference temperature near to it, or "
+        f"{remedy}"
     )
 
 
 def _temperatures_of(test: "Measured") -> np.ndarray:
     """Return the temperatures (n,) [°C] from the column of a sweep, or from the name of its table if there is no such
-    column. The array is empty if they are unknown."""
+    column. The array is empty if they are unknown, or if the name contains several temperatures."""
     if not isinstance(test, Sweep):
         return np.empty(0)
     T = (test.raw or {}).get("temperature", np.empty(0))
     T = T[np.isfinite(T)]
-    return celsius(T if T.size else np.array(temperatures_in(test.table)))
+    stated = temperatures_in(test.table)
+    return celsius(T if T.size else np.array(stated if len(stated) == 1 else []))
 
 
 def shift_numbers(found: MasterCurve) -> Content:
@@ -256,6 +267,7 @@ def shift_numbers(found: MasterCurve) -> Content:
         "reference_temperature_C": float(celsius(s.temperatures[s.reference])),
         "given": s.given,
         "temperatures_C": celsius(s.temperatures).tolist(),
+        "ignored_temperatures_C": celsius(found.ignored).tolist(),
         "log10_a": s.log_a.tolist(),
         "log10_a_standard_errors": s.log_a_errors.tolist(),
         "log10_b": s.log_b.tolist(),

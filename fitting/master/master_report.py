@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from fitting.master.master_curve import MasterCurve
+from fitting.master.temperature_laws import reasons_for_missing_laws
 from fitting.readers.units import celsius
 from liverjax.core.files import write_rows
 from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save
@@ -33,7 +34,8 @@ def write_master_curve(out: Path, found: MasterCurve) -> None:
 
 
 def shift_table(found: MasterCurve) -> str:
-    """Return a text table with the shift factors at each temperature, followed by one line for each law."""
+    """Return a text table with the shift factors at each temperature, one line for each law, and a note if a law is
+    missing."""
     s, moved = found.shifts, bool(np.any(found.shifts.log_b))
     lines = [
         f"{'temperature':>12s} {'log10 a_T':>18s}{'log10 b_T':>18s}" if moved else f"{'temperature':>12s} log10 a_T"
@@ -46,6 +48,7 @@ def shift_table(found: MasterCurve) -> str:
     for law in found.laws:
         numbers = ", ".join(f"{n} {v:.5g} ± {e:.2g}" for n, (v, e) in law.numbers.items())
         lines.append(f"{law.name}: {numbers}; root mean square distance from the shift factors {law.apart:.2g} decades")
+    lines += [f"note: {reason}" for reason in reasons_for_missing_laws(s, found.laws)]
     return "\n".join(lines)
 
 

@@ -42,6 +42,18 @@ def temperature_laws_of(shifts: Shifts) -> list[TemperatureLaw]:
     return sorted(found, key=lambda law: law.apart)
 
 
+def reasons_for_missing_laws(shifts: Shifts, laws: list[TemperatureLaw]) -> list[str]:
+    """Return a note if a law is missing in `laws`, the result of `temperature_laws_of`; otherwise an empty list."""
+    count = len(shifts.temperatures)
+    if count < 3:
+        return [f"no law is fitted to {count} temperatures: Arrhenius needs three, and WLF needs four"]
+    if count < 4:
+        return [f"WLF needs four temperatures, and there are {count}"]
+    if all(law.name != "WLF" for law in laws):
+        return ["WLF is left out: the shift factors do not curve over the temperature as in this law"]
+    return []
+
+
 def _whitening(shifts: Shifts) -> np.ndarray:
     """Return the whitening matrix W (K - 1, K) for the log shift factors of K sweeps. If W is multiplied by the errors
     of these factors, the entries of the product are independent with variance 1. The covariance of the errors contains

@@ -18,7 +18,8 @@ from liverjax.core.errors import InputError
 #: Temperatures that differ by less than this value [K] count as one temperature, because the temperature of an
 #: instrument varies by some tenths of a kelvin.
 SAME = 1.0
-#: Maximum difference [K] between the measured temperatures of a table and the temperature in its name.
+#: Maximum difference [K] between the measured temperatures of a table and the temperature in its name. A sweep whose
+#: temperature changes by more than this value counts as several sweeps.
 OFF_NAME = 5.0
 #: A temperature in the name of a table. A hyphen after a letter or a digit separates words ("Sweep-25C"), so it is not
 #: a minus sign. A value before a slash is a rate ("5 K/min").
@@ -31,6 +32,7 @@ class AtTemperatures(NamedTuple):
     sweeps: list[Sweep]
     temperatures: np.ndarray  # (K,) [K], ascending
     shift_factors: np.ndarray | None  # (K,) shift factors a_T; None if the files give no shift factors
+    ignored: np.ndarray = np.zeros(0)  # temperatures [K] that are left out, because too few points remain
 
 
 def read_temperatures(paths: Sequence[Path]) -> AtTemperatures:
@@ -50,9 +52,8 @@ def read_temperatures(paths: Sequence[Path]) -> AtTemperatures:
             parts += _by_temperature(str(path), name, sweep)
     parts.sort(key=lambda part: part[0])
     group = _index_of_group(np.array([part[0] for part in parts]), exact=True)
-    groups, ignored = _with_enough_points(
-        [[parts[k] for k in np.flatnonzero(group == g)] for g in range(max(group) + 1)]
-    )
+    every = [[parts[k] for k in np.flatnonzero(group == g)] for g in range(max(group) + 1)]
+    groups, ignored = _with_enough_points(every)
     if len(groups) < 2:
         also = "".join(f"; {note}" for note in ignored)
         raise InputError(
@@ -71,7 +72,8 @@ def read_temperatures(paths: Sequence[Path]) -> AtTemperatures:
         )
         ignored = [*ignored, note]
     sweeps[0] = sweeps[0]._replace(notes=(*sweeps[0].notes, *ignored))
-    return AtTemperatures(sweeps, means, factors if known.all() else None)
+    few = [float(np.mean([p[0] for p in g])) for g in every if not any(g is own for own in groups)]
+    return AtTemperatures(sweeps, means, factors if known.all() else None, np.array(few))
 
 
 def _with_enough_points(
@@ -139,7 +141,8 @@ def with_usable_points(
     notes += [f"at {', '.join(places)} °C: {note}" for note, places in told.items()]
     sweeps[0] = sweeps[0]._replace(notes=(*sweeps[0].notes, *notes))
     factors = None if data.shift_factors is None else data.shift_factors[kept]
-    return data._replace(sweeps=sweeps, temperatures=data.temperatures[kept], shift_factors=factors)
+    ignored = np.append(data.ignored, data.temperatures[~kept])
+    return data._replace(sweeps=sweeps, temperatures=data.temperatures[kept], shift_factors=factors, ignored=ignored)
 
 
 def _mean_factor(factors: np.ndarray) -> float:

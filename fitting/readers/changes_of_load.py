@@ -32,20 +32,31 @@ def first_is_imposed(time: np.ndarray, first: np.ndarray, second: np.ndarray) ->
     or linear in parts. So it has fewer straight parts than the response. In long smooth cycles, the
     imposed quantity has less noise. If these rules do not decide, the imposed quantity is the column that changes less
     in the second half."""
+    return _first_or_not(time, first, second)[0]
+
+
+def is_uncertain(time: np.ndarray, first: np.ndarray, second: np.ndarray) -> bool:
+    """Return whether only the smoothness or the size of the changes shows which column is imposed
+    (`first_is_imposed`). This is the case for long smooth cycles, for example."""
+    return not _first_or_not(time, first, second)[1]
+
+
+def _first_or_not(time: np.ndarray, first: np.ndarray, second: np.ndarray) -> tuple[bool, bool]:
+    """Return the result of `first_is_imposed`, and whether a constant column or the straight parts decide it."""
     late, both = len(time) // 2, (first, second)
     moves = [float(np.ptp(v[late:])) / max(float(np.max(np.abs(v))), 1e-300) for v in both]
     if min(moves) < _LEAST_CHANGE and max(moves) > _MOVES * min(moves):
-        return moves[0] < moves[1]
+        return moves[0] < moves[1], True
     # Scale the columns to the range 1. A constant column needs no scale.
     scaled = [v / (float(np.ptp(v)) or 1.0) for v in both]
     noise = [noise_of_series(v) for v in scaled]
     allowed = float(np.clip(_OF_SCATTER * max(noise), _CLOSE, _LOOSE))
     parts = [len(_corners_of_load(time, v, allowed)) for v in scaled]
     if parts[0] != parts[1] and min(parts) <= _MOST_PARTS:
-        return parts[0] < parts[1]
+        return parts[0] < parts[1], True
     if max(noise) > _SMOOTHER * min(noise) and min(parts) > _MOST_PARTS:
-        return noise[0] < noise[1]
-    return moves[0] <= moves[1]
+        return noise[0] < noise[1], False
+    return moves[0] <= moves[1], False
 
 
 def begins_of_changes(time: np.ndarray, driven: np.ndarray, begun: float) -> np.ndarray:

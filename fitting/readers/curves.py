@@ -17,6 +17,7 @@ from fitting.readers.tables.text_tables import (
     summary_rows,
     text_of,
     to_number,
+    without_comments,
     without_multiples,
 )
 from fitting.readers.units import STRESS_UNITS
@@ -175,7 +176,8 @@ def _rows_of_curves(file: Path) -> tuple[list[dict[str, str]], list[tuple[int, s
     twice = [name for name in names if names.count(name) > 1 and _USED.match(name)]
     if twice:
         raise InputError(f"{file} has two columns {twice[0]}: remove one of them")
-    every = cells[first + 1 : end]
+    read = [name != "test" and bool(_USED.match(name)) for name in names]
+    every = [without_comments(own, read) for own in cells[first + 1 : end]]
     tests = [k for k, name in enumerate(names) if name == "test"]  # cells of this column are never numbers
     labelled = [[cell for k, cell in enumerate(own) if k not in tests or is_summary(cell)] for own in every]
     summaries = summary_rows(labelled)

@@ -449,6 +449,7 @@ def without_inertia(
         f"below {share}"
     )
     grey = np.column_stack([sweep.angular_frequency, sweep.storage, sweep.loss])[lost]
+    grey = grey if sweep.grey is None else np.concatenate([sweep.grey, grey])
     return some(sweep, ~lost)._replace(notes=(*sweep.notes, note, left), grey=grey)
 
 

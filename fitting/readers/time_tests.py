@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fitting.readers.base_line import OFFSET, RESTING, base_line
-from fitting.readers.changes_of_load import begins_of_changes, first_is_imposed
+from fitting.readers.changes_of_load import begins_of_changes, first_is_imposed, is_uncertain
 from fitting.readers.checks.course_in_time import BEYOND_NOISE, another_course, of_ringing, of_the_other_kind
 from fitting.readers.checks.scattering_load import without_scatter
 from fitting.readers.noise_of_series import (
@@ -348,6 +348,22 @@ def kind_of(path: str | os.PathLike) -> str:
     if len(form) == 1:
         return "relaxation" if form == ("modulus",) else "creep"
     return "relaxation" if first_is_imposed(columns["time"], columns[form[0]], columns[form[1]]) else "creep"
+
+
+def read_test_of_any_kind(path: str | os.PathLike, sample: Sample) -> TimeTest:
+    """Read a relaxation or creep test of the kind that `kind_of` finds. A note says if this kind is uncertain."""
+    test = read_time_test(path, kind_of(path), sample)
+    rows = np.isfinite(test.answer)
+    if not is_uncertain(test.time[rows], test.driven[rows], test.answer[rows]):
+        return test
+    imposed, other, kind = ("strain", "stress", "creep")
+    if test.kind == "creep":
+        imposed, other, kind = ("stress", "strain", "relaxation")
+    note = (
+        f"the {imposed} is taken as imposed, but the rows hardly show which quantity was imposed: if it was the "
+        f"{other}, fit this file alone with python -m fitting {kind}"
+    )
+    return test._replace(notes=(*test.notes, note))
 
 
 def _own_table(kind: str) -> str:

@@ -131,9 +131,14 @@ def _points_left(sweep: Sweep) -> dict[str, np.ndarray]:
 
 def values(fit: Fit | TimeFit) -> dict[str, tuple[float, float]]:
     """Return the value and the standard error of each parameter that is compared. The keys are the names of the
-    parameters in the report. The standard errors do not contain the error of the gap (--gap-error). A wrong gap
-    multiplies the moduli at all frequencies by one factor. So it cannot change a parameter if one end of the band is
-    left out."""
+    parameters in the report. The strengths of a spectrum are not compared. The standard errors do not contain the error
+    of the gap (--gap-error). A wrong gap multiplies the moduli at all frequencies by one factor. So it cannot change a
+    parameter if one end of the band is left out."""
+    return {n: own for n, own in every_value(fit).items() if not n.startswith("strengths[")}
+
+
+def every_value(fit: Fit | TimeFit) -> dict[str, tuple[float, float]]:
+    """Return the values and standard errors of `values`, and also those of the strengths of a spectrum."""
     gap, every = fit.details.get("gap_error", 0.0), _with_all_errors(fit)
     if not gap:
         return every
@@ -151,7 +156,7 @@ def moduli_among(fit: Fit | TimeFit) -> set[str]:
 def _with_all_errors(fit: Fit | TimeFit) -> dict[str, tuple[float, float]]:
     if fit.parameters is not None:
         rows = zip(fit.kind.names, fit.parameters.values, fit.parameters.standard_errors, strict=True)
-        return {n: (float(v), float(e)) for n, v, e in rows if not n.startswith("strengths[")}
+        return {n: (float(v), float(e)) for n, v, e in rows}
     u = fit.uncertainty
     out = {n: (float(v), float(e)) for n, v, e in zip(u.names, u.values, u.standard_errors, strict=True)}
     rest = float(fit.model.shear_modulus * (1 - fit.model.ratios.sum()))

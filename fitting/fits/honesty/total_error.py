@@ -41,19 +41,20 @@ def of_described_sizes(per_size: tuple[float, float]) -> float:
 
 def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
     """Return the errors of the parameters: for each source of error, a dictionary whose keys are the parameter names of
-    `edges.values`. The error of the gap is a part of the share `geometry`.
+    `edges.every_value`. The error of the gap is a part of the share `geometry`.
 
     The share `band` is the larger change of a parameter if one end of the band is left out. This change counts only if
     it is larger than expected from noise (`edges.decided_by`). The share is the square root of a difference: the square
     of this change, minus the square of the standard error. If noise alone causes a change larger than the standard
     error, the square of that change is subtracted instead. If the result is very large
     (`edges.RUNS_AWAY`), the share is the absolute value of the parameter or its standard error, whichever is larger.
+    This change is not computed for the strengths of a spectrum, so their share `band` is 0.
     For the share `long_times`, the farther end of `long_times.equilibrium_interval` is converted to a standard
     deviation, and the standard error is subtracted (as squares). The share `short_times` is the part of G0 that relaxed
     before the record (module `short_times`). The share `rise_of_load` is the change if the load was a step at the first
     row that shows the new load.
     """
-    known = edges.values(fit)
+    known = edges.every_value(fit)
     noise = {name: error for name, (_, error) in known.items()}
     gap, usual = fit.details.get("gap_error"), Simulation()
     relative = fit.details.get("geometry_error", of_geometry(usual, None if gap is None else gap * usual.height))
@@ -103,4 +104,4 @@ def _of_bias(fit: Fit | TimeFit, moved: np.ndarray) -> dict[str, float]:
     out = {name: abs(float(d)) for name, d in zip(names, moved, strict=True)}
     if fit.parameters is None:
         out["equilibrium_modulus"] = abs(float(equilibrium_change(fit.uncertainty.values, moved)))
-    return {name: out[name] for name in edges.values(fit)}
+    return {name: out[name] for name in edges.every_value(fit)}

@@ -138,6 +138,29 @@ def split_cells(line: str, delimiter: str) -> list[str]:
     return [c.strip() for c in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])]
 
 
+#: A number with a comment behind it.
+_COMMENTED = re.compile(r"([-+]?[.,]?\d[\d.,]*(?:[eE][-+]?\d+)?)\s*#.*")
+
+
+def without_comments(cells: list[str], read: list[bool]) -> list[str]:
+    """Return the cells of a row without comments. A comment begins with `#`, either after a number in a column that is
+    read, or in a cell after the last column. Names such as "3 #2" in other columns stay whole.
+
+    Args:
+        cells: cells of the row.
+        read: for each column, whether its numbers are read.
+    """
+    out, last = [], len(read) - 1
+    for k, cell in enumerate(cells):
+        found = _COMMENTED.fullmatch(cell) if k <= last and read[k] else None
+        if k > last and cell.startswith("#"):
+            break
+        out.append(found[1] if found else cell)
+        if found and k == last:
+            break
+    return out
+
+
 def refuse_unnamed_numbers(
     path: str | os.PathLike, number: int, cells: list[str], headings: list[str], delimiter: str
 ) -> None:
