@@ -18,7 +18,7 @@ from liverjax.mesh.adjacency import PAIRS
 from liverjax.mesh.nodal import integrals, summed
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.solvers import block_matrix, preconditioner
-from liverjax.solvers.krylov import Known, chebyshev, differentiable_solve
+from liverjax.solvers.krylov import Known, chebyshev, differentiable_solve, length
 from liverjax.solvers.preconditioner import Coarse
 from liverjax.tensors.matrices import Matrix, dot
 
@@ -157,8 +157,8 @@ def solved(mesh: TetMesh, flow: Flow, b: jax.Array, guess: Guess | None = None) 
 
     def found(lack, begin):
         r = -lack(begin)
-        size = jnp.linalg.norm(r)
-        tolerance = guess.looser * flow.tolerance * jnp.linalg.norm(b) / jnp.where(size > 0, size, 1.0)
+        size = length(r)
+        tolerance = guess.looser * flow.tolerance * length(b) / jnp.where(size > 0, size, 1.0)
         return begin + differentiable_solve(apply, r, precondition, tolerance, 2000, known)
 
     begin = jax.lax.stop_gradient(flow.mask * guess.pressure)

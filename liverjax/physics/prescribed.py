@@ -11,6 +11,7 @@ from liverjax.core.history import entry_at
 from liverjax.core.struct import Indices, Number, Numbers, param, static, struct
 from liverjax.mesh.selection import AXES
 from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.base import Free
 
 
 @struct
@@ -108,3 +109,20 @@ def given_acceleration(place: Callable[[Number], jax.Array], k: Number, steps: i
     # In a run of one step, the step k = 1 would contain the same jump once more.
     begin = jnp.where(k == 0, 2.0, 1.0 if steps > 1 else 0.0)
     return (begin * now + (k - n) * change) / dt**2
+
+
+def strained_by_motion(free: Free, start: jax.Array, x: jax.Array) -> jax.Array:
+    """Return whether fixed and prescribed nodes strain the body at positions x (V, 3) by more than roundoff.
+
+    `start` (V, 3) is the reference shape. The nodes strain the body if the distances between them change. For nodes
+    that are free along an axis, the displacements along the other axes are compared.
+    """
+    fixed = free.mask == 0
+    held = jnp.all(fixed, axis=1)
+    first = jnp.argmax(held)
+    longer = jnp.linalg.norm(x - x[first][None], axis=1) - jnp.linalg.norm(start - start[first][None], axis=1)
+    partly, moved = fixed & ~held[:, None], x - start
+    low = jnp.min(moved, axis=0, initial=jnp.inf, where=partly)
+    high = jnp.max(moved, axis=0, initial=-jnp.inf, where=partly)
+    most = jnp.maximum(jnp.max(high - low), jnp.max(jnp.abs(longer), initial=0.0, where=held))
+    return most > 8 * float(jnp.finfo(x.dtype).eps) * jnp.maximum(jnp.max(jnp.abs(x)), jnp.max(jnp.abs(start)))

@@ -34,11 +34,11 @@ def conjugate_gradients(
 
     The iterations also stop at a direction without positive curvature. The statistics contain the true residual.
     """
-    goal = tolerance * jnp.linalg.norm(b)
+    goal = tolerance * length(b)
 
     def go_on(c):
         _, r, _, _, k, positive = c
-        return (jnp.sqrt(jnp.vdot(r, r)) > goal) & (k < max_iterations) & positive
+        return (length(r) > goal) & (k < max_iterations) & positive
 
     def step(c):
         x, r, p, rz_before, k, _ = c
@@ -100,7 +100,7 @@ def stabilised_biconjugate_gradients(
 
     The arguments are the same as for `conjugate_gradients`. Each iteration needs two products with A.
     """
-    goal = tolerance * jnp.linalg.norm(b)
+    goal = tolerance * length(b)
     one = jnp.ones((), b.dtype)
 
     def divided(a, b):
@@ -108,7 +108,7 @@ def stabilised_biconjugate_gradients(
 
     def go_on(t):
         _, r, _, _, rho, alpha, omega, k = t
-        return (jnp.linalg.norm(r) > goal) & (k < max_iterations) & (rho * alpha * omega != 0)
+        return (length(r) > goal) & (k < max_iterations) & (rho * alpha * omega != 0)
 
     def step(t):
         x, r, p, v, rho_old, alpha, omega, k = t
@@ -228,18 +228,27 @@ def started(
     `solver` is a function (b, tolerance) -> (solution, residual divided by |b|). `tolerance` is the upper bound of |b -
     A x| / |b|. Return the solution and its residual, divided by |b|.
     """
-    left, size = b - matvec(near), jnp.linalg.norm(b)
-    helps = jnp.linalg.norm(left) < size
+    left, size = b - matvec(near), length(b)
+    helps = length(left) < size
     begin, left = jnp.where(helps, near, 0.0), jnp.where(helps, left, b)
-    rest = jnp.linalg.norm(left) / jnp.where(size > 0, size, 1.0)
+    rest = length(left) / jnp.where(size > 0, size, 1.0)
     more, residual = solver(left, tolerance / jnp.where(rest > 0, rest, 1.0))
     return begin + more, rest * residual
 
 
+def length(v: jax.Array) -> jax.Array:
+    """Return the Euclidean norm |v|. In float32, squares of small numbers are 0, so v is divided by max |v| first."""
+    if v.dtype != jnp.float32:
+        return jnp.sqrt(jnp.vdot(v, v).real)
+    most = jnp.max(jnp.abs(v))
+    shown = v / jnp.where(most > 0, most, 1.0)
+    return most * jnp.sqrt(jnp.vdot(shown, shown))
+
+
 def true_residual(matvec: Callable[[jax.Array], jax.Array], b: jax.Array, x: jax.Array) -> jax.Array:
     """Return the relative residual |b - A x| / |b|."""
-    scale = jnp.linalg.norm(b)
-    return jnp.linalg.norm(b - matvec(x)) / jnp.where(scale > 0, scale, 1.0)
+    scale = length(b)
+    return length(b - matvec(x)) / jnp.where(scale > 0, scale, 1.0)
 
 
 class Known(NamedTuple):
@@ -278,7 +287,7 @@ def differentiable_solve(
             x, residual = solver(b)
         good = _good(residual, tolerance, b)
         if diagonal is not None:
-            good = good | (found & (residual * jnp.linalg.norm(b) <= 4 * eps * jnp.linalg.norm(diagonal * x)))
+            good = good | (found & (residual * length(b) <= 4 * eps * length(diagonal * x)))
         return jnp.where(good, x, jnp.nan)
 
     return jax.lax.custom_linear_solve(matvec, b, solve=solve, transpose_solve=solve, symmetric=symmetric)
