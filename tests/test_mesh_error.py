@@ -155,7 +155,9 @@ def test_the_derivative_of_the_estimate_contains_the_change_of_the_stiffness():
         return mesh_error.estimated_error(scene, rich, x, jnp.zeros_like(x)).positions[0]
 
     change, slope = jax.jvp(estimate, (1000.0,), (1000.0,))
-    assert spaces == ["element", "element"] and jnp.max(jnp.abs(change)) > 1e-4
+    known = _pushed(jnp.asarray(1000.0))
+    jax.jit(lambda load: spaces.append(mesh_error.richer(known).scene.solve.volumetric) or load)(1.0)
+    assert spaces == ["element"] * 3 and jnp.max(jnp.abs(change)) > 1e-4
     assert jnp.max(jnp.abs(slope + change)) < 0.02 * jnp.max(jnp.abs(change))  # tolerance of the linear solve: 1e-2
 
 

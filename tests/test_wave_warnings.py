@@ -153,6 +153,29 @@ def test_a_frequency_of_smoothed_noise_is_named(width):
         assert any(named) == alone and cautions.frequencies_with_motion(own, found) == [0][alone:]
 
 
+def test_misfit_of_the_model_is_no_noise():
+    """A layered body without labels had residuals as large as its motion, and its data were to be removed."""
+    field = plane_waves((5, 5, 5))
+    size = np.sqrt(np.mean(np.abs(field.displacement[0][field.mask]) ** 2) / 2)
+    each = SimpleNamespace(correlations=[SimpleNamespace(seen=True, level=size)] * len(field.noise))
+    found = SimpleNamespace(whole=each, parts=None)
+    for noise, said in ((0.03 * size, 0), (0.2 * size, 1)):
+        own = field._replace(noise=np.full(len(field.noise), noise))
+        assert len(cautions._of_no_motion(own, 0, found)) == said
+
+
+def test_errors_that_all_frequencies_share_do_not_explain_scatter():
+    """A common bias of 10 % excused any scatter around the springpot."""
+    n, rng = 8, np.random.default_rng(0)
+    G = np.linspace(1000, 2000, n)
+    wrong = 1 + 0.05 * rng.standard_normal(n)
+    fit = SimpleNamespace(storage=G, loss=G / 5, solution=SimpleNamespace(u=np.zeros(2)))
+    shared = np.concatenate([0.1 * G, 0.1 * G / 5])[None]
+    for factor, beyond in ((1.1, False), (wrong, True)):
+        sweep = SimpleNamespace(storage=G * factor, loss=G / 5 * factor, storage_sd=0.002 * G, loss_sd=0.002 * G / 5)
+        assert report._beyond_errors(fit, sweep, shared) == beyond
+
+
 def test_sweeps_are_without_frequencies_of_noise(tmp_path):
     part = {key: [1.0, 2.0, 3.0, 4.0] for key in ("storage_Pa", "loss_Pa", "error_storage_Pa", "error_loss_Pa")}
     content = {"frequencies_Hz": [40.0, 60.0, 80.0, 100.0], "whole": part, "regions": None}

@@ -222,6 +222,10 @@ def map_of(
 ) -> WaveMap:
     """Find the map of the modulus from the waves.
 
+    The given noise may be too small at some frequencies. Then the search is repeated, with noise in the ratios that the
+    residuals show. `file` contains only the first search. If the second search does not converge but the first one did,
+    the first map is returned.
+
     Args:
         course: the result of `course_of`.
         file: HDF5 file that is written after every step. If it is None, no file is written.
@@ -232,14 +236,14 @@ def map_of(
     Raises:
         InputError: `file` belongs to another fit or cannot be read.
 
-    The given noise may be too small at some frequencies. Then the search is repeated, with noise in the ratios that the
-    residuals show. `file` contains only the first search.
     """
     found, w = _one_map(course, file, resume, draws, progress), course.waves
     larger = found.white_factor / found.white_factor.min()
     if not larger.max() > UNEQUAL:
         return found
     again = _one_map(course._replace(waves=w._replace(sd=larger * w.sd)), None, False, draws, progress)
+    if again.distance > FAR >= found.distance:
+        return found
     chi2 = again.chi2_of_frequencies * larger**2
     return again._replace(
         chi2_of_frequencies=chi2,

@@ -134,8 +134,8 @@ def refuse_traced(mesh: TetMesh) -> None:
     """
     if isinstance(mesh.tetrahedra, jax.core.Tracer) or isinstance(mesh.pattern.edges, jax.core.Tracer):
         raise InputError(
-            "the mesh error cannot be estimated inside jax.jit if the mesh is an argument of the compiled function: "
-            "estimate the error outside jax.jit"
+            "the mesh error cannot be estimated inside jax.jit if the mesh is an argument of the compiled function (or "
+            "of jax.vmap): estimate the error outside, or use the mesh as a constant of the function"
         )
 
 

@@ -232,12 +232,10 @@ def _may_lock(scene: Scene) -> bool:
             own = names.put(own, name, value, refused_name(name))
         laws.append(own)
     try:
-        numbers = [(a.bulk_modulus(), a.shear_modulus()) for a in laws]
-    except InputError:  # a law may have no moduli
-        return True
-    try:
-        return any(bool(jnp.any(jnp.asarray(bulk) > _LOCKS * jnp.asarray(shear))) for bulk, shear in numbers)
-    except jax.errors.ConcretizationTypeError:
+        with jax.ensure_compile_time_eval():  # inside `jax.jit`, constant moduli are known
+            numbers = [(jnp.asarray(a.bulk_modulus()), jnp.asarray(a.shear_modulus())) for a in laws]
+            return any(bool(jnp.any(bulk > _LOCKS * shear)) for bulk, shear in numbers)
+    except (InputError, jax.errors.ConcretizationTypeError):  # a law may have no moduli
         return True
 
 

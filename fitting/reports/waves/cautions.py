@@ -55,10 +55,10 @@ def cautions_of_elastography(organ: Organ, found: Found, drawn: WaveMap | None) 
             f"the search for the map stopped {drawn.distance:.2g} standard deviations from the minimum: compare the "
             "map with regions"
         )
-    if drawn is not None and np.any(drawn.noise_factor > CORRELATED * drawn.white_factor):
+    if drawn is not None and np.any(alike := drawn.noise_factor > CORRELATED * drawn.white_factor):
         told.append(
             "map: the residuals at neighbouring voxels are correlated, so the standard deviations of the map are "
-            f"enlarged {drawn.noise_factor.max():.3g} times"
+            f"enlarged {drawn.noise_factor[alike].max():.3g} times"
         )
     told += [] if drawn is None else _of_edges_in_map(drawn)
     # The mean of n squares has the standard deviation sqrt(2/n). ROUGH is added because the noise that divides the
@@ -156,6 +156,9 @@ NO_MOTION = 1.2
 #: The same limit for noise that is estimated from correlated residuals. The fit follows a part of such noise, so this
 #: estimate is often 20 to 30 % too small for noise alone.
 NO_MOTION_IN_RESIDUALS = 1.5
+#: The noise that follows from residuals is believed up to this multiple of the estimate from fourth differences: for
+#: smoothed noise the ratio is 2.5 to 7. Above it, the residuals show an inadequate model, for example other regions.
+SMOOTHED = 8.0
 
 
 def frequencies_with_motion(field: WaveField, found: Found) -> list[int]:
@@ -173,7 +176,8 @@ def _of_no_motion(field: WaveField, f: int, found: Found | None = None) -> list[
     u = field.displacement[f][field.mask]
     size, noise, most = float(np.sqrt(np.nanmean(np.abs(u) ** 2) / 2)), float(field.noise[f]), NO_MOTION
     each = None if found is None else found.whole if found.parts is None else found.parts
-    if each is not None and f < len(each.correlations) and each.correlations[f].seen and not size < most * noise:
+    seen = each is not None and f < len(each.correlations) and each.correlations[f].seen
+    if each is not None and seen and most * noise <= size < SMOOTHED * noise:
         noise, most = each.correlations[f].level, NO_MOTION_IN_RESIDUALS
     if not size < most * noise:
         return []

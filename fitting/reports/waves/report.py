@@ -140,7 +140,7 @@ def _springpots(sweeps: dict[str, Path], content: Content | None = None) -> tupl
         u = viscoelastic.estimates(fit.solution, fit.kind, size, None)[1]
         off = float(np.mean(fit.relative_errors(sweep)))
         assert u is not None
-        if off > MISSED and _beyond_errors(fit, sweep):
+        if off > MISSED and _beyond_errors(fit, own, shared):
             told.append(
                 f"{name}: the {fit.kind.name} misses the moduli over the frequencies by {100 * off:.2g} % on average; "
                 "use the moduli of each frequency"
@@ -192,12 +192,16 @@ def _moved_numbers(fit: "Fit", sweep: "Sweep", moved: np.ndarray) -> np.ndarray:
     return (with_slope(fit.kind.values, fit.solution.u)[1] @ steps).T
 
 
-def _beyond_errors(fit: "Fit", sweep: "Sweep") -> bool:
-    """Return whether a fit misses the moduli by more than their standard deviations explain."""
+def _beyond_errors(fit: "Fit", sweep: "Sweep", shared: np.ndarray) -> bool:
+    """Return whether a fit misses the moduli at n frequencies by more than noise and the changes `shared` (k, 2 n) [Pa]
+    explain. Each of these k changes may be present with a standard normal factor. The standard deviations of the sweep
+    are noise alone."""
     if sweep.storage_sd is None or sweep.loss_sd is None:
         return True
-    off = np.concatenate([(fit.storage - sweep.storage) / sweep.storage_sd, (fit.loss - sweep.loss) / sweep.loss_sd])
-    return float(off @ off) > EXPLAINED * max(1, len(off) - len(fit.solution.u))
+    sd = np.concatenate([sweep.storage_sd, sweep.loss_sd])
+    off, S = np.concatenate([fit.storage - sweep.storage, fit.loss - sweep.loss]) / sd, shared / sd
+    chi2 = off @ off - off @ S.T @ np.linalg.solve(np.eye(len(S)) + S @ S.T, S @ off)
+    return float(chi2) > EXPLAINED * max(1, len(off) - len(fit.solution.u))
 
 
 def _of_frequencies_left_out(organ: Organ, moves: list[int]) -> list[str]:
