@@ -16,7 +16,7 @@ from liverjax.mesh.locate import doubled_vertices
 from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.physics.contact.pressed import PressedObstacle
 from liverjax.scenes.checks.choices import check_choices
-from liverjax.simulation.cautions import of_contacts, of_mesh
+from liverjax.simulation.cautions import of_contacts, of_mesh, of_run
 from liverjax.simulation.cautions.of_mesh import cautions_of_mesh, mesh_sentence
 from liverjax.simulation.cautions.of_run import cautions_of_run
 from liverjax.simulation.mesh_error import MeshError
@@ -468,3 +468,17 @@ def test_the_locking_warning_uses_the_moduli_of_each_region():
         assert said.startswith("the bulk modulus is 1e+03 times the shear modulus")
     covered = replace(soft, law=stiff, region=(lj.Region(elements=np.arange(E), law=soft.law),))
     assert of_mesh.of_locking(soft) == of_mesh.of_locking(covered) == []
+
+
+@pytest.mark.parametrize(
+    ("precision", "dt", "told"), [("float32", 1e-5, True), ("float32", 1e-3, False), ("float64", 1e-5, False)]
+)
+def test_a_time_step_too_short_for_float32_is_told(precision, dt, told):
+    """The body stood still, and every second step had converged."""
+    body = lj.Body(density=1000.0, gravity=jnp.array([0.0, 0.0, -9.81]))
+    solve = lj.Solve(kind="dynamic", dt=dt, precision=precision)
+    mesh = lj.shapes.box((0.1, 0.1, 0.1), (1, 1, 1))
+    falling = lj.Scene(mesh=mesh, law=lj.laws.NeoHookean(mu=1e3, bulk=1e4), body=body, solve=solve)
+    still = SimpleNamespace(positions=np.stack([mesh.points] * 3))
+    said = of_run._of_unresolved_motion(falling, still)
+    assert [" is too short for float32" in words for words in said] == [True] * told

@@ -16,8 +16,9 @@ ONE_STEP = 8
 
 ADVICE = {
     CONVERGED: "converged",
-    STALLED: "the residual stopped decreasing above the tolerance: use float64, smaller steps or a larger tolerance "
-    "(in float32, with very stiff springs or with very short time steps, roundoff may not allow a smaller residual)",
+    STALLED: "the residual stopped decreasing above the tolerance: use float64, a larger tolerance or, in float64 or "
+    "for a static scene, smaller steps (in float32, with very stiff springs or with very short time steps, roundoff "
+    "may not allow a smaller residual, and smaller time steps make it larger)",
     NOT_FINITE: "a residual was not finite, usually because of an inverted element: use smaller loads or steps, or a "
     "law with continued_below; if you wrote the law, check it with `python -m liverjax check`",
     INDEFINITE: "the stiffness has a negative eigenvalue and no equilibrium was reached (the body buckles, collapses, "
