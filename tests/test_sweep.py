@@ -405,6 +405,7 @@ def test_what_cannot_be_resumed_is_refused(files, capsys):
         ("mesh.points\n700\n", "'mesh.points' would change the mesh"),
         ("mesh.points.0.1\n700\n", "which is the same in all runs of a sweep: remove this column"),
         ("mesh.cells.0\n3\n", "'mesh.cells.0' would change the mesh"),
+        ("solve.reduced_tolerance\n0.1\n", "has no effect, because a sweep uses no reduced model"),
         ("fixed.0.nodes.0\n3\n", "is not a number of the scene file"),
         ("solve.tolerance\n0.1\n0\n", "row 2: .*tolerance = 0.0 must be above 0"),
     ],

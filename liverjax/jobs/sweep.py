@@ -87,6 +87,10 @@ def _check_names(scene: Scene, parameters: Path, names: Sequence[str]) -> None:
                 f"{parameters}: parameter {name!r} would change the mesh, which is the same in all runs of a sweep: "
                 "remove this column"
             )
+        if name == "solve.reduced_tolerance":
+            raise InputError(
+                f"{parameters}: parameter {name!r} has no effect, because a sweep uses no reduced model: remove it"
+            )
         try:
             shape = np.shape(numbers_at(scene, name))
         except InputError as error:
