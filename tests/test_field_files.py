@@ -2,6 +2,7 @@
 
 import json
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_field import SURFACE, _scene, _write
@@ -174,3 +175,38 @@ def test_scenes_with_other_nodes_or_other_elements_have_different_meshes(tmp_pat
     assert a.number_of_elements == b.number_of_elements and a.number_of_nodes != b.number_of_nodes
     _refused_as_other_mesh(replace(first, mesh=a), b)
     _refused_as_other_mesh(first, lj.tet_mesh(first.mesh.points, np.asarray(first.mesh.tetrahedra)[::-1]))
+
+
+@pytest.mark.parametrize("name", ["viscosity.ratios.0", "region.0.law.mu", "body.density"])
+def test_a_parameter_without_a_value_per_element_has_no_map(tmp_path, name):
+    """The command ended with a traceback, or the error seemed to be one of the scene."""
+    scene = _scene(tmp_path)
+    prony = lj.Prony(ratios=jnp.array([0.3, 0.2]), relaxation_times=jnp.array([1.0, 0.1]))
+    region = lj.Region(elements=jnp.arange(5), law={"mu": 900.0})
+    scene = replace(scene, viscosity=prony, region=(region,), solve=replace(scene.solve, dt=0.1))
+    with pytest.raises(lj.InputError, match=f"'{name}' cannot have one value per element, so it has no map"):
+        field.start_of(scene_numbers.Problem((scene,), ()), name)
+
+
+def test_a_part_of_a_parameter_is_no_further_parameter(tmp_path, capsys):
+    """The later name replaced a part of the earlier one, whose standard error was then very large."""
+    _write(tmp_path / "u.csv", _scene(tmp_path), 1e-6)
+    files = [str(tmp_path / name) for name in ("scene.toml", "u.csv")]
+    assert (
+        main(
+            ["field", *files, "--parameters", "body.gravity,body.gravity.0", "--noise", "1e-6", "--out", str(tmp_path)]
+        )
+        == 2
+    )
+    assert "names body.gravity.0, which is a part of body.gravity" in capsys.readouterr().err
+
+
+def test_static_displacements_from_a_loaded_shape_are_refused(tmp_path, capsys):
+    """All predicted displacements were 0, whatever the parameters."""
+    _write(tmp_path / "u.csv", scene := _scene(tmp_path), 1e-6)
+    text = (tmp_path / "scene.toml").read_text().replace("[mesh]", '[mesh]\nis = "loaded"')
+    (tmp_path / "scene.toml").write_text(text)
+    files = [str(tmp_path / name) for name in ("scene.toml", "u.csv")]
+    assert scene.points_are != "loaded"
+    assert main(["field", *files, "--parameters", "law.mu", "--out", str(tmp_path)]) == 2
+    assert "displacements count from this shape" in capsys.readouterr().err

@@ -80,6 +80,11 @@ def _problem(options: argparse.Namespace) -> Problem:
     scenes, data = [], []
     for scene_file, data_file in zip(options.files[::2], options.files[1::2], strict=True):
         scene = load_scene(scene_file)
+        if scene.points_are == "loaded" and scene.solve.dt is None:
+            raise InputError(
+                f'{scene_file}: [mesh] is = "loaded" in a scene without dt: displacements count from this shape, so '
+                "they are 0 for all parameters; give the mesh of the unloaded body, or dt and a load that changes"
+            )
         scenes.append(scene)
         data.append(own := read_displacements(data_file, scene, options.noise, options.unit))
         if options.noise is not None and np.any(np.isfinite(own.sd) & (own.sd != options.noise)):
@@ -104,6 +109,8 @@ def _fit_few_numbers(options: argparse.Namespace, problem: Problem) -> int:
         numbers_at(problem.scenes[0], name)
         if names.count(name) > 1:
             raise InputError(f"--parameters names {name} twice: remove one")
+        if part := next((other for other in names if other.startswith(f"{name}.")), None):
+            raise InputError(f"--parameters names {part}, which is a part of {name}: remove one")
     writable(options.out, ("field.json",), inputs=_inputs(options))
     bar, told = cost_bar("iterations")
     with bar, _unknown_effects() as unknown:

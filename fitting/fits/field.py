@@ -34,7 +34,8 @@ from liverjax.core.errors import InputError
 from liverjax.core.files import mark_of, refuse_other, whole
 from liverjax.core.versions import versions
 from liverjax.scenes.regions import set_by_regions
-from liverjax.scenes.scene import numbers_at
+from liverjax.scenes.scene import numbers_at, with_parameters
+from liverjax.scenes.scene_checks import check_before_run
 
 #: Standard deviations of ln(modulus) in the prior, in the order in which they are tried. With the first, the body is
 #: nearly uniform. With the last, the stiffness may vary strongly.
@@ -76,8 +77,8 @@ def start_of(problem: Problem, name: str) -> jax.Array:
     """Return the value of the parameter in each element (E,) before the fit.
 
     Raises:
-        InputError: the scenes have different meshes, the parameter is a list or not positive, or a [[region]] sets the
-            parameter in every element.
+        InputError: the scenes have different meshes, the parameter is a list or not positive, it cannot have one value
+            per element, or a [[region]] sets it in every element.
     """
     scene = problem.scenes[0]
     E = scene.mesh.number_of_elements
@@ -88,9 +89,9 @@ def start_of(problem: Problem, name: str) -> jax.Array:
             raise InputError("the scenes have different meshes: use one mesh in all scenes")
     base = numbers_at(scene, name)
     if isinstance(base, tuple) or jnp.ndim(base) > 1 or (jnp.ndim(base) == 1 and base.shape != (E,)):
+        entry = f"one entry of the list, e.g. {name}.0" if isinstance(base, tuple) else "another parameter, e.g. law.mu"
         raise InputError(
-            f"{name!r} is a list, and a field can multiply only one number, or one number per element: name one entry "
-            f"of the list, e.g. {name}.0"
+            f"{name!r} is a list, and a field can multiply only one number, or one number per element: name {entry}"
         )
     if not np.all(np.asarray(base) > 0):
         raise InputError(f"a field of {name!r} must begin at a value above 0: change this value in the scene")
@@ -99,7 +100,19 @@ def start_of(problem: Problem, name: str) -> jax.Array:
             f"a [[region]] sets {name} in every element, so nothing is left to map: remove this parameter from a "
             "[[region]]"
         )
-    return jnp.broadcast_to(base, (E,))
+    values = jnp.broadcast_to(base, (E,))
+    for each in problem.scenes:
+        try:
+            check_before_run(with_parameters(each, {name: values}))
+        except (InputError, TypeError, ValueError):
+            known = False
+        else:
+            known = not name.startswith("region.")
+        if not known:
+            raise InputError(
+                f"{name!r} cannot have one value per element, so it has no map: name another parameter, e.g. law.mu"
+            )
+    return values
 
 
 def given_by_regions(problem: Problem, name: str) -> tuple[np.ndarray, np.ndarray]:
