@@ -279,3 +279,36 @@ fixed = [{where = {x_max = 0.0}}]
     for finer in (None, lambda mesh: {}):
         with pytest.warns(UserWarning, match=r"the effect of the mesh error on the fit is unknown: \[mesh\] is = "):
             assert scene_numbers.discretisation_errors(problem, {}, finer).mesh is None
+
+
+def _column(cells: int, order: int) -> lj.Scene:
+    """Return a column under its own weight. Its sides cannot move sideways."""
+    mesh = lj.shapes.box((0.03, 0.03, 0.12), (1, 1, cells))
+    mesh = lj.quadratic(mesh) if order == 2 else mesh
+    sides = [lj.Fixed(nodes=mesh.node_sets[f"{a}_{end}"], axes=a) for a in "xy" for end in ("min", "max")]
+    return lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=5000.0, bulk=10000.0),
+        fixed=(lj.Fixed(nodes=mesh.node_sets["z_min"]), *sides),
+        body=lj.Body(density=1000.0, gravity=jnp.array([0.0, 0.0, -1.0])),
+    )
+
+
+@pytest.mark.ci
+def test_the_mesh_error_is_estimated_inside_elements():
+    """The estimate inside linear elements was the interpolated error of the nodes: half as large, and unrelated."""
+    from fitting.fits import scene_numbers
+    from fitting.readers.displacements import Displacements, locate, predicted
+
+    points = np.random.default_rng(0).uniform([0.001, 0.001, 0.001], [0.029, 0.029, 0.119], (40, 3))
+    fine, coarse = _column(8, 2), _column(4, 1)
+
+    def at(scene: lj.Scene) -> Displacements:
+        nodes, weights, _ = locate(scene.mesh, points)
+        none = np.zeros((len(points), 3))
+        return Displacements(np.zeros(len(points), int), nodes, weights, none, none + 1e-6)
+
+    moved = [np.asarray(predicted(at(s), s, lj.simulate(s).check().positions)) for s in (fine, coarse)]
+    true = (moved[0] - moved[1]).ravel() / 1e-6
+    found = scene_numbers.discretisation_errors(scene_numbers.Problem((coarse,), (at(coarse),)), {}).mesh
+    assert np.linalg.norm(found - true) < 0.2 * np.linalg.norm(true)

@@ -15,7 +15,7 @@ from fitting.methods.estimate import Estimate, bias_sentences, errors_and_correl
 from fitting.methods.least_squares import Solution, levenberg_marquardt_host
 from fitting.methods.noise.alike_noise import alike_noise
 from fitting.methods.noise.uneven_noise import uneven_root
-from fitting.readers.displacements import Displacements, weighted_differences
+from fitting.readers.displacements import Displacements, error_between_nodes, weighted_differences
 from fitting.rigs.time_steps import change_with_small_steps
 from liverjax.core import status
 from liverjax.core.errors import InputError
@@ -270,7 +270,10 @@ def _errors_in(scene: Scene, data: Displacements, finer: Finer | None) -> tuple[
             error = mesh_error_of(prepared(scene), run.positions, run.reactions, run.pressure, finer)
         exact = replace(run, positions=run.positions + error.positions)
         good = np.all(run.status == status.CONVERGED) and np.all(error.found)
-        of_mesh = np.where(good, readings(exact) - readings(run), np.nan)
+        moved = readings(exact) - readings(run)
+        if error.added is not None:
+            moved = moved + error_between_nodes(data, scene.mesh, error.added)
+        of_mesh = np.where(good, moved, np.nan)
         cause = "a step of the run failed, or the mesh is too coarse for an estimate"
     except InputError as e:
         run, of_mesh, cause = None, np.full(np.size(data.measured), np.nan), str(e)

@@ -10,6 +10,8 @@ from scipy.spatial import cKDTree
 
 from fitting.readers.tables.text_tables import decimal_sign, split_cells, split_line, text_of, to_number
 from liverjax.core.errors import InputError
+from liverjax.mesh.adjacency import PAIRS
+from liverjax.mesh.promotion import cubic, quadratic
 from liverjax.mesh.shape_functions import functions
 from liverjax.mesh.tetrahedra import UNITS, TetMesh
 from liverjax.scenes.scene import Scene
@@ -280,3 +282,29 @@ def weighted_differences(data: Displacements, scene: Scene, positions: jax.Array
     """Return predicted minus measured displacements, divided by the standard deviation of the noise, as a flat array (3
     n,). A component that was not measured gives 0."""
     return ((predicted(data, scene, positions) - data.measured) / data.sd).ravel()
+
+
+def error_between_nodes(data: Displacements, mesh: TetMesh, added: jax.Array) -> np.ndarray:
+    """Return the part (3 n,) of the mesh error between the nodes, divided by the standard deviation of the noise.
+
+    `added` (T, A, 3) [m]: coefficients of the richer shape functions (`MeshError.added`). They are 0 at the nodes.
+    """
+    own = 4 if mesh.order == 1 else 10
+    rich = quadratic(mesh) if mesh.order == 1 else cubic(mesh)
+    numbers = np.asarray(rich.element_nodes_on_host).T  # (E, 10) or (E, 20)
+    element_of = {tuple(row): k for k, row in enumerate(numbers[:, :4].tolist())}
+    element = np.array([element_of.get(tuple(row), -1) for row in np.asarray(data.nodes)[:, :4].tolist()])
+    inside = np.flatnonzero(element >= 0)  # a measured node has no element
+    weights = np.asarray(data.weights)[inside]
+    L = weights[:, :4].T.copy()
+    if mesh.order == 2:
+        for k, (i, j) in enumerate(PAIRS):  # an edge middle has the coordinates 1/2 and 1/2
+            L[i] += 0.5 * weights[:, 4 + k]
+            L[j] += 0.5 * weights[:, 4 + k]
+    N = functions(rich.order, L)[0][own:].T
+    coefficients = np.asarray(added)[
+        np.asarray(data.step)[inside, None], numbers[element[inside], own:] - mesh.number_of_nodes
+    ]
+    part = np.zeros(np.shape(data.measured))
+    part[inside] = np.einsum("na,nac->nc", N, coefficients)
+    return (part / data.sd).ravel()

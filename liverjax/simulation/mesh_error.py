@@ -99,6 +99,11 @@ class MeshError:
     pressure: jax.Array | None = param(
         "Pa", "(T, V), of a fluid; None: no fluid, or the error of its pressures is unknown", default=None
     )
+    added: jax.Array | None = param(
+        "m",
+        "(T, A, 3) coefficients of the A richer shape functions that the run does not have; None: on a refined mesh",
+        default=None,
+    )
 
     def change(self, of: Callable[[jax.Array, jax.Array], Any], result: Any) -> tuple[Any, Any]:
         """Return a quantity of interest and its estimated change on an infinitely fine mesh.
@@ -175,6 +180,15 @@ class Richer:
         if rich.order == 2:
             return on_middles(rich, x.T).T
         return jnp.concatenate([x, jnp.zeros((rich.number_of_nodes - len(x), 3), x.dtype)])
+
+    def added(self, x: jax.Array, number_of_nodes: int) -> jax.Array | None:
+        """Return the coefficients (A, 3) [m] of the A functions that the run does not have, from richer positions x."""
+        rich = self.scene.mesh
+        if self.within is not None:
+            return None
+        if rich.order == 3:
+            return x[number_of_nodes:]
+        return (x - on_middles(rich, x[:number_of_nodes].T).T)[number_of_nodes:]
 
     def on_nodes(self, force: jax.Array, number_of_nodes: int) -> jax.Array:
         """Convert forces on the functions of the richer space to forces (V, 3) [N] on the nodes of the run."""
@@ -297,8 +311,10 @@ def _step(scene: Scene, rich: Richer, sizes: Sizes, state: State, given: Any) ->
     sound = jnp.all(volume_ratios(e.mesh, positions(e, q + dq, one)) > 0) & jnp.all(jnp.isfinite(dq))
     end = forces(e, jnp.where(sound, q + dq, q), one)
     found = sound & positive & (iterations < MOST_LINEAR_ITERATIONS)
+    after = positions(e, q + dq, one)
     change = {
-        "positions": positions(e, q + dq, one)[: len(x)] - x,
+        "positions": after[: len(x)] - x,
+        "added": rich.added(after, len(x)),
         "reactions": rich.on_nodes(reaction, len(x)) - reactions,
         # The nodes of the run are the first vertices of the refined mesh.
         "pressure": None if pressure is None else end.pressure[: len(x)] - pressure,
